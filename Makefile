@@ -1,0 +1,66 @@
+# Every target creates what it needs. `make help` lists them.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+
+SHARD  ?= 0
+CONFIG ?= configs/datagen/tiny.yaml
+OUT    ?= data/$(basename $(notdir $(CONFIG)))
+DATA   ?= data/tiny
+PYTHON ?= python3.11
+ARGS   ?=
+
+VENV    := .venv
+PIP     := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+RUNTIME := $(VENV)/.runtime-installed
+DEV     := $(VENV)/.dev-installed
+
+.PHONY: help setup render train test test-slow check bench clean
+
+help: ## list the targets and their variables
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
+	@echo
+	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) ARGS=$(ARGS) PYTHON=$(PYTHON)"
+
+$(VENV)/bin/python:
+	@command -v $(PYTHON) >/dev/null || { echo "make: $(PYTHON) not found. Blender's module needs Python 3.11: install it, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11"; exit 2; }
+	@echo "creating $(VENV)"
+	@$(PYTHON) -m venv $(VENV)
+
+$(RUNTIME): $(VENV)/bin/python pyproject.toml requirements.lock
+	@echo "installing the generator (about a minute)"
+	@$(PIP) --editable '.[datagen]'
+	@$(VENV)/bin/python blender_scripts/check_blender.py
+	@touch $@
+
+$(DEV): $(RUNTIME)
+	@echo "installing the development tools"
+	@$(PIP) --editable '.[datagen,dev]'
+	@touch $@
+
+setup: $(RUNTIME) ## create .venv and install the generator
+
+render: $(RUNTIME) ## plan CONFIG into OUT if needed, then render shard SHARD
+	@$(VENV)/bin/datagen render --config $(CONFIG) --out $(OUT) --shard $(SHARD) $(ARGS)
+
+train: ## train on the shards in DATA
+	@echo "make train: the network is not part of this version yet (DATA=$(DATA) would be its input); see README.md, 'What is here'"; exit 2
+
+test: $(DEV) ## run the tests, without those marked slow
+	@$(VENV)/bin/python -m pytest -q -m "not slow" $(ARGS)
+
+test-slow: $(DEV) ## run the tests that take minutes
+	@$(VENV)/bin/python -m pytest -q -m slow $(ARGS)
+
+check: $(DEV) ## lint, types, import contracts, then the tests
+	@$(VENV)/bin/ruff check .
+	@$(VENV)/bin/ruff format --check .
+	@$(VENV)/bin/lint-imports
+	@$(VENV)/bin/mypy
+	@$(MAKE) --no-print-directory test
+
+bench: $(DEV) ## measure the performance claims of README.md on this machine
+	@$(VENV)/bin/python -m pytest -q -s tests/benchmarks --override-ini "python_files=bench_*.py" --override-ini addopts=--import-mode=importlib $(ARGS)
+
+clean: ## remove .venv and caches; rendered data stays
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

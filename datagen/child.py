@@ -1,0 +1,86 @@
+"""Child processes that report by JSON lines on standard output and log on standard error.
+
+A motion is rendered by a short-lived worker, and Blender runs in a child of that: memory
+that leaks goes with the process, and a crash costs one motion, not the shard.
+"""
+
+import ctypes
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+__all__ = ["ChildError", "die_with_parent", "emit", "run_child"]
+
+LOG_LINES_SHOWN = 12
+PR_SET_PDEATHSIG = 1
+
+
+class ChildError(RuntimeError):
+    """A child process failed; carries its exit status and the end of its log."""
+
+    def __init__(self, message: str, *, status: int, log: Path) -> None:
+        super().__init__(message)
+        self.status = status
+        self.log = log
+
+
+def emit(**event: Any) -> None:
+    """Send one event to the parent process."""
+    sys.stdout.write(json.dumps(event) + "\n")
+    sys.stdout.flush()
+
+
+def die_with_parent() -> None:
+    """Ask the kernel to end this process when its parent dies, even by kill -9.
+
+    Otherwise an orphan would go on rendering into the staging folder of a resumed run.
+    Linux only; elsewhere the lock on the shard is what keeps two runs apart.
+    """
+    if sys.platform == "linux":
+        parent = os.getppid()
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # died between the two calls
+            os._exit(1)
+
+
+def run_child(
+    command: Sequence[str], *, log: Path, on_event: Callable[[dict[str, Any]], None], env: dict[str, str] | None = None
+) -> None:
+    """Run `command`, hand every JSON line of its output to `on_event`, keep the rest in `log`.
+
+    Raises ChildError with the end of the log when the child exits with a status other than 0.
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("ab") as log_file:
+        start = log_file.tell()
+        process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=log_file, text=True, env={**os.environ, **(env or {})}
+        )
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if line.startswith("{"):
+                    on_event(json.loads(line))
+                else:
+                    log_file.write(line.encode())
+                    log_file.flush()
+            status = process.wait()
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+    if status != 0:
+        ended = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
+        raise ChildError(f"{_log_end(log, start)}\n(child ended {ended}; full log: {log})", status=status, log=log)
+
+
+def _log_end(log: Path, start: int) -> str:
+    with log.open("rb") as file:
+        file.seek(start)
+        lines = file.read().decode(errors="replace").strip().splitlines()
+    return "\n".join(lines[-LOG_LINES_SHOWN:]) if lines else "no output"

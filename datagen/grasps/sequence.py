@@ -1,0 +1,52 @@
+"""GraspSequence: the motion of one hand and one object, before anything is drawn."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+__all__ = ["GraspQuality", "GraspSequence"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspQuality:
+    """How good a kept grasp is; measured while it was simulated or read.
+
+    `rise_m` and `center_distance_m` are GraspXL's two success figures (FORMATS 2.3).
+    """
+
+    rise_m: float  # object height at the end minus at the start
+    center_distance_m: float  # hand centre to object centre at the end
+    max_penetration_m: float  # hand vertices into the object's own mesh, worst instant
+    digits_in_contact: int  # of five, at the end
+    slip_lift_m: float
+    slip_manipulation_m: float
+    contact_force_n: float  # summed normal force at the end
+    attempts: int  # simulated until this one was kept, itself included
+
+
+@dataclass(frozen=True, kw_only=True)
+class GraspSequence:
+    """MANO-format hand parameters and object poses at a constant rate (GraspXL layout).
+
+    Hand: axis-angle, MANO joint order (wrist, index, middle, pinky, ring, thumb).
+    `hand_pose` holds the full local rotations when `flat_hand_mean` is true and offsets
+    from the model's mean pose when it is false, as in smplx. The wrist turns about the
+    rest wrist joint; `hand_translation_world` is added last (smplx `transl`).
+    """
+
+    sequence_id: str
+    object_uid: str
+    hand_model: str  # "openhand" or "mano"
+    side: Literal["right", "left"]
+    fps: float
+    flat_hand_mean: bool
+    betas: Float[np.ndarray, "beta"]
+    hand_orientation_world: Float[np.ndarray, "frame 3"]
+    hand_pose: Float[np.ndarray, "frame 45"]
+    hand_translation_world: Float[np.ndarray, "frame 3"]
+    T_world_from_obj: Float[np.ndarray, "frame 4 4"]
+    contact_force_n: Float[np.ndarray, "frame 5"]  # per digit: thumb, index, middle, ring, pinky
+    grasp_frame: int  # first frame in which the closed hand carries the object
+    quality: GraspQuality

@@ -1,0 +1,163 @@
+"""One shard, from plan to verified files: skip what is staged, render the rest, commit.
+
+Motions are independent, so they run in as many worker processes as asked for; the result
+does not depend on their number or order. A run that was killed is continued by running it
+again.
+"""
+
+import fcntl
+import os
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from datagen.child import ChildError, run_child
+from datagen.config import DatasetConfig, config_as_json, config_hash, first_difference
+from datagen.library import open_library
+from datagen.plan import Plan, make_plan, read_plan, same_plan, write_plan
+from shards.dataset import DatasetInfo, read_dataset_info, write_dataset_info
+from shards.writer import ShardSummary, commit_shard, is_motion_staged, is_shard_committed
+
+__all__ = ["PipelineError", "Progress", "RenderOptions", "plan_dataset", "render_shard"]
+
+PLAN_FILE = "plan.parquet"
+
+
+class PipelineError(RuntimeError):
+    """A shard could not be finished; what is staged stays and is used by the next run."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions:
+    """How this machine does the work; nothing here changes the data."""
+
+    device: str  # auto, cpu, cuda, optix, hip, metal
+    workers: int
+    threads_per_worker: int | None  # None: the cores divided by the workers
+
+
+@dataclass(frozen=True, kw_only=True)
+class Progress:
+    """One step of one motion."""
+
+    motion_id: str
+    phase: str  # staged, grasp, scene, render, annotate, done, skipped
+    done: int
+    total: int
+
+
+def plan_dataset(config: DatasetConfig, out: Path, *, commit: str) -> Plan:
+    """Write dataset.json and plan.parquet, or return the plan that is there when it is the same.
+
+    PipelineError when `out` holds a dataset of another configuration.
+    """
+    plan = make_plan(
+        config.plan,
+        dataset_seed=config.seed,
+        object_uids=[uid for uid in open_library(config.objects).uids() if uid not in config.objects.exclude],
+        split_rule=config.split,
+        n_cameras=config.sampling.cameras.n_cameras,
+        n_frames=config.sampling.clip.n_frames,
+        image_size=config.sampling.cameras.image_size,
+        samples=config.sampling.render.samples,
+    )
+    if (out / "dataset.json").exists():
+        _require_same_config(read_dataset_info(str(out)), config, out)
+        if (out / PLAN_FILE).exists() and same_plan(read_plan(out / PLAN_FILE), plan):
+            return plan
+    write_plan(plan, out / PLAN_FILE)
+    info = DatasetInfo(
+        name=config.name,
+        config=config_as_json(config),
+        config_hash=config_hash(config),
+        generator_commit=commit,
+        split_rule=config.split,
+    )
+    write_dataset_info(str(out), info)
+    return plan
+
+
+def render_shard(
+    config_path: Path,
+    config: DatasetConfig,
+    plan: Plan,
+    out: Path,
+    shard: int,
+    options: RenderOptions,
+    report: Callable[[Progress], None],
+) -> ShardSummary:
+    """Render what is missing of one shard and commit it. Safe to repeat, kill and repeat."""
+    motions = plan.shard(shard)
+    with _lock(out / "staging" / f"shard-{shard:05d}.lock"):
+        if is_shard_committed(out, shard):
+            return commit_shard(out, shard, [m.motion_id for m in motions])
+        waiting = []
+        for motion in motions:
+            if is_motion_staged(out, shard, motion.motion_id):
+                report(Progress(motion_id=motion.motion_id, phase="staged", done=1, total=1))
+            else:
+                waiting.append(motion.motion_index)
+        _run_workers(config_path, out, waiting, shard, options, report)
+        return commit_shard(out, shard, [m.motion_id for m in motions])
+
+
+def _run_workers(
+    config_path: Path,
+    out: Path,
+    motion_indices: list[int],
+    shard: int,
+    options: RenderOptions,
+    report: Callable[[Progress], None],
+) -> None:
+    threads = options.threads_per_worker or max(1, (os.cpu_count() or 1) // options.workers)
+    report_lock = threading.Lock()
+
+    def render(motion_index: int) -> ChildError | None:
+        motion_id = f"motion-{motion_index:06d}"
+
+        def on_event(event: dict) -> None:
+            with report_lock:
+                report(Progress(motion_id=motion_id, **event))
+
+        command = [sys.executable, "-m", "datagen.worker", "--config", str(config_path), "--out", str(out)]
+        command += ["--motion", str(motion_index), "--device", options.device, "--threads", str(threads)]
+        log = out / "staging" / f"shard-{shard:05d}" / f"{motion_id}.log"
+        try:
+            # BLAS threads would only fight with Cycles, and one thread sums in one order everywhere.
+            run_child(command, log=log, on_event=on_event, env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
+        except ChildError as error:
+            return error
+        return None
+
+    with ThreadPoolExecutor(max_workers=options.workers) as pool:
+        errors = [error for error in pool.map(render, motion_indices) if error is not None]
+    if errors:
+        raise PipelineError(
+            f"shard {shard}: {len(errors)} of {len(motion_indices)} motions failed; the others are staged and kept. "
+            f"First failure:\n{errors[0]}"
+        )
+
+
+def _require_same_config(info: DatasetInfo, config: DatasetConfig, out: Path) -> None:
+    if info.config_hash != config_hash(config):
+        difference = first_difference(info.config, config_as_json(config))
+        raise PipelineError(
+            f"{out}: holds a dataset of another configuration ({difference}); "
+            "choose another --out, or delete this one to start over"
+        )
+
+
+@contextmanager
+def _lock(path: Path) -> Iterator[None]:
+    """Two runs on one shard would stage over each other; the lock ends with the process."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise PipelineError(f"{path}: another process is rendering this shard; wait for it or stop it") from error
+        yield
