@@ -8,28 +8,20 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import yaml
 
 from datagen.grasps.config import GraspConfig
 from datagen.library import ObjectsConfig
 from datagen.objects.fields import TargetsConfig
+from datagen.pack import ShardConfig
 from datagen.plan import PlanConfig
 from datagen.sampling.config import SamplingConfig
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
 
-__all__ = ["DatasetConfig", "ShardConfig", "config_as_json", "config_hash", "load_config"]
-
-
-@dataclass(frozen=True, kw_only=True)
-class ShardConfig:
-    """How arrays are stored (figures: DECISIONS.md)."""
-
-    depth_compression: Literal["pxr24", "zip"]
-    rgb_codec: Literal["png", "jpeg", "webp"]  # png needs nothing to read; the others need Pillow
-    rgb_quality: int  # 1..100, jpeg and webp only
+__all__ = ["DatasetConfig", "config_as_json", "config_hash", "load_config"]
 
 
 @dataclass(frozen=True, kw_only=True)

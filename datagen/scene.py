@@ -49,7 +49,7 @@ class Background:
 
     hdri: str  # name of one of the HDRIs that ship with Blender ("studio"), or a file path
     rotation_rad: float
-    strength: float
+    strength: float  # mean luminance seen over the whole sphere; every HDRI is normalised to 1 first
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,7 +93,8 @@ class HandLook:
     bump: float  # strength of fine skin relief, 0..1
     nail_gloss: float  # 0..1
     sleeve_color_rgb: tuple[float, float, float]  # linear
-    sleeve_weave: float  # pattern scale
+    sleeve_weave: float  # size of the weave; 1: threads 1.2 mm apart
+    nail_mask_png: bytes | None = None  # white on the nails, in the UV layout of `skin_png`
 
 
 @dataclass(frozen=True, kw_only=True)

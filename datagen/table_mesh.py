@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from datagen.scene import Table
 
-__all__ = ["TableMesh", "inside_flat_top", "table_mesh"]
+__all__ = ["TableMesh", "inside_flat_top", "table_from_world", "table_mesh"]
 
 CORNER_SEGMENTS = 10  # per quarter turn of the outline
 EDGE_SEGMENTS = 5  # per quarter turn of the edge's profile
@@ -25,7 +25,6 @@ class TableMesh:
 
     verts_world: Float[np.ndarray, "vert 3"]  # metres
     faces: Int[np.ndarray, "face 3"]
-    top_outline_xy: Float[np.ndarray, "corner 2"]  # world; convex, counter-clockwise border of the flat top
 
 
 def table_mesh(table: Table) -> TableMesh:
@@ -33,7 +32,7 @@ def table_mesh(table: Table) -> TableMesh:
 
     Raises ValueError when the table is thinner or narrower than its roundings.
     """
-    edge = min(EDGE_RADIUS_M, 0.45 * table.thickness_m)
+    edge = _edge_radius_m(table)
     if min(table.size_xy_m) <= 2.0 * CORNER_RADIUS_M or edge <= 0.0:
         raise ValueError(
             f"table of {table.size_xy_m} m and {table.thickness_m} m thickness: sides must exceed "
@@ -54,22 +53,46 @@ def table_mesh(table: Table) -> TableMesh:
     return TableMesh(
         verts_world=np.concatenate([*rings, poles]),
         faces=_ring_faces(len(rings), size),
-        top_outline_xy=rings[0][:, :2].copy(),
     )
 
 
+def table_from_world(table: Table) -> Float[np.ndarray, "2 3"]:
+    """[R | t]: (x, y) of the world to the table's own axes about its centre, metres."""
+    R = _turn(table)
+    return np.column_stack([R, -R @ np.asarray(table.center_xy_m)])
+
+
 def inside_flat_top(
-    mesh: TableMesh, points_xy: Float[np.ndarray, "*batch 2"]
+    table: Table, x_table: Float[np.ndarray, "*batch"], y_table: Float[np.ndarray, "*batch"]
 ) -> Bool[np.ndarray, "*batch"]:
-    """True where a world (x, y) lies on the flat top. Exact: the outline is a convex polygon."""
-    corner = mesh.top_outline_xy
-    side = np.roll(corner, -1, axis=0) - corner
-    normal = np.stack([-side[:, 1], side[:, 0]], axis=-1)  # points inward
-    offset = np.sum(normal * corner, axis=-1)
-    inside = np.ones(points_xy.shape[:-1], dtype=bool)
-    for n, o in zip(normal, offset):
-        inside &= points_xy[..., 0] * n[0] + points_xy[..., 1] * n[1] >= o
+    """True where a point of the table's own plane lies on the flat polygon of `table_mesh`."""
+    edge = _edge_radius_m(table)
+    x, y = np.abs(x_table), np.abs(y_table)
+    half_x, half_y = 0.5 * table.size_xy_m[0], 0.5 * table.size_xy_m[1]
+    inside = (x <= half_x - edge) & (y <= half_y - edge)
+    # Only in the four corners does the outline differ from a rectangle.
+    corner = inside & (x > half_x - CORNER_RADIUS_M) & (y > half_y - CORNER_RADIUS_M)
+    points = np.stack([x_table[corner], y_table[corner]], axis=-1)
+    inside[corner] = _inside_convex(_outline(table, edge), points)
     return inside
+
+
+def _inside_convex(
+    outline: Float[np.ndarray, "corner 2"], points: Float[np.ndarray, "point 2"]
+) -> Bool[np.ndarray, "point"]:
+    side = np.roll(outline, -1, axis=0) - outline
+    normal = np.stack([-side[:, 1], side[:, 0]], axis=-1)  # points inward
+    return np.all(points @ normal.T >= np.sum(normal * outline, axis=-1), axis=-1)
+
+
+def _edge_radius_m(table: Table) -> float:
+    return min(EDGE_RADIUS_M, 0.45 * table.thickness_m)
+
+
+def _turn(table: Table) -> Float[np.ndarray, "2 2"]:
+    """R_local_from_world in the plane."""
+    c, s = np.cos(table.yaw_rad), np.sin(table.yaw_rad)
+    return np.array([[c, s], [-s, c]])
 
 
 def _outline(table: Table, inset_m: float) -> Float[np.ndarray, "corner 2"]:
@@ -85,8 +108,7 @@ def _outline(table: Table, inset_m: float) -> Float[np.ndarray, "corner 2"]:
 
 
 def _to_world(table: Table, points: Float[np.ndarray, "corner 2"]) -> Float[np.ndarray, "corner 2"]:
-    c, s = np.cos(table.yaw_rad), np.sin(table.yaw_rad)
-    return points @ np.array([[c, s], [-s, c]]) + np.asarray(table.center_xy_m)
+    return points @ _turn(table) + np.asarray(table.center_xy_m)
 
 
 def _ring_faces(n_rings: int, size: int) -> Int[np.ndarray, "face 3"]:
@@ -95,7 +117,9 @@ def _ring_faces(n_rings: int, size: int) -> Int[np.ndarray, "face 3"]:
     top_pole, bottom_pole = n_rings * size, n_rings * size + 1
     fans = [
         np.stack([np.full(size, top_pole), here, after], axis=-1),
-        np.stack([np.full(size, bottom_pole), (n_rings - 1) * size + after, (n_rings - 1) * size + here], axis=-1),
+        np.stack(
+            [np.full(size, bottom_pole), (n_rings - 1) * size + after, (n_rings - 1) * size + here], axis=-1
+        ),
     ]
     walls = []
     for ring in range(n_rings - 1):

@@ -14,7 +14,7 @@ except ImportError:
     class _Unchecked:
         """`Float[np.ndarray, "frame 4 4"]` reads the same and means `np.ndarray`."""
 
-        def __class_getitem__(cls, item):
+        def __class_getitem__(cls, item: tuple[type, str]) -> type:
             return item[0]
 
-    Bool = Float = Float32 = Int = UInt8 = _Unchecked  # type: ignore[assignment,misc]
+    Bool = Float = Float32 = Int = UInt8 = _Unchecked  # type: ignore[assignment]

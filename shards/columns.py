@@ -13,7 +13,15 @@ import pyarrow as pa
 
 from shards.errors import RowError
 
-__all__ = ["Column", "arrow_schema", "column", "columns_of", "markdown_table", "rows_from_table", "table_from_rows"]
+__all__ = [
+    "Column",
+    "arrow_schema",
+    "column",
+    "columns_of",
+    "markdown_table",
+    "rows_from_table",
+    "table_from_rows",
+]
 
 Row = TypeVar("Row")
 
@@ -111,8 +119,6 @@ def column_values(chunked: pa.ChunkedArray, c: Column) -> Sequence[Any]:
     if not c.shape:
         return chunked.to_pylist()
     array = chunked.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):  # older pyarrow returns a chunked array here
-        array = pa.concat_arrays(array.chunks) if array.num_chunks else pa.array([], c.arrow_type)
     lengths = None
     if isinstance(c.shape[0], str):
         lengths = np.diff(array.offsets.to_numpy())
@@ -145,10 +151,17 @@ def _checked(value: Any, c: Column, *, where: str, row: int) -> Any:
         kind = str if c.dtype == "string" else bytes
         if not isinstance(value, kind):
             raise RowError(
-                "wrong type", where=where, row=row, column=c.name, expected=c.dtype, found=type(value).__name__
+                "wrong type",
+                where=where,
+                row=row,
+                column=c.name,
+                expected=c.dtype,
+                found=type(value).__name__,
             )
         if c.choices and value not in c.choices:
-            raise RowError("unknown value", where=where, row=row, column=c.name, expected=c.choices, found=repr(value))
+            raise RowError(
+                "unknown value", where=where, row=row, column=c.name, expected=c.choices, found=repr(value)
+            )
         return value
     return _checked_numbers(value, c, where=where, row=row)
 
@@ -159,7 +172,9 @@ def _checked_numbers(value: Any, c: Column, *, where: str, row: int) -> Any:
         isinstance(want, str) or want == have for want, have in zip(c.shape, array.shape)
     )
     if not fits_shape:
-        raise RowError("wrong shape", where=where, row=row, column=c.name, expected=c.shape, found=array.shape)
+        raise RowError(
+            "wrong shape", where=where, row=row, column=c.name, expected=c.shape, found=array.shape
+        )
     target = np.dtype(c.dtype)
     same_kind = target.kind == array.dtype.kind or (target.kind in "iu" and array.dtype.kind in "iu")
     if not same_kind and not (target.kind == "f" and array.dtype.kind in "iu") and array.size:
@@ -169,12 +184,13 @@ def _checked_numbers(value: Any, c: Column, *, where: str, row: int) -> Any:
         if array.min() < limits.min or array.max() > limits.max:
             found = f"{array.min()}..{array.max()}"
             raise RowError("out of range", where=where, row=row, column=c.name, expected=target, found=found)
-    if target.kind == "f" and not c.allow_nan and not np.all(np.isfinite(array)):
-        count = int(np.count_nonzero(~np.isfinite(array)))
-        raise RowError(
-            "not a finite number", where=where, row=row, column=c.name, found=f"{count} of {array.size} values"
-        )
-    converted = array.astype(target)
+    with np.errstate(over="ignore"):  # becomes infinite and is refused below
+        converted = array.astype(target)
+    if target.kind == "f":
+        bad = np.isinf(converted) if c.allow_nan else ~np.isfinite(converted)
+        if np.any(bad):
+            found = f"{np.count_nonzero(bad)} of {bad.size} values"
+            raise RowError("not a finite number", where=where, row=row, column=c.name, found=found)
     return converted.item() if not c.shape else converted
 
 

@@ -9,7 +9,7 @@ from mathutils import Matrix
 
 from datagen.objects.mesh import ObjectMesh
 
-__all__ = ["add_mesh", "add_object_mesh", "set_pose", "set_vertices"]
+__all__ = ["add_mesh", "add_object_mesh", "add_vertex_attribute", "set_pose", "set_vertices"]
 
 _AUTO_SMOOTH_RAD = np.radians(40.0)
 
@@ -22,9 +22,8 @@ def add_mesh(
     corner_uv: Float[np.ndarray, "face 3 2"],
     face_material: Int[np.ndarray, "face"],
     materials: list[bpy.types.Material],
-    pass_index: int,
 ) -> bpy.types.Object:
-    """A smooth-shaded triangle mesh in the current scene; `pass_index` is its object-index value."""
+    """A smooth-shaded triangle mesh in the current scene; `face_material` indexes `materials`."""
     mesh = bpy.data.meshes.new(name)
     n_corners = 3 * len(faces)
     mesh.vertices.add(len(verts))
@@ -40,14 +39,11 @@ def add_mesh(
     mesh.update(calc_edges=True)
     mesh.shade_smooth()
     drawn = bpy.data.objects.new(name, mesh)
-    drawn.pass_index = pass_index
     bpy.context.scene.collection.objects.link(drawn)
     return drawn
 
 
-def add_object_mesh(
-    mesh: ObjectMesh, materials: list[bpy.types.Material], *, pass_index: int
-) -> bpy.types.Object:
+def add_object_mesh(mesh: ObjectMesh, materials: list[bpy.types.Material]) -> bpy.types.Object:
     """The held object at the origin of its own frame.
 
     Vertices at the same place are joined first: a file that splits them along UV seams would
@@ -63,7 +59,6 @@ def add_object_mesh(
         corner_uv=mesh.corner_uv[solid],
         face_material=mesh.face_material[solid],
         materials=materials,
-        pass_index=pass_index,
     )
     if mesh.smooth:
         drawn.data.set_sharp_from_angle(angle=_AUTO_SMOOTH_RAD)

@@ -6,7 +6,17 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["GraspQuality", "GraspSequence"]
+__all__ = ["GraspQuality", "GraspSequence", "TableEdge"]
+
+StartKind = Literal["table", "edge", "held"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableEdge:
+    """A straight table edge in the plane z = 0: the table lies behind it, nothing in front."""
+
+    point_xy_m: tuple[float, float]
+    outward_xy: tuple[float, float]  # unit, away from the table
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,3 +60,7 @@ class GraspSequence:
     contact_force_n: Float[np.ndarray, "frame 5"]  # per digit: thumb, index, middle, ring, pinky
     grasp_frame: int  # first frame in which the closed hand carries the object
     quality: GraspQuality
+    start: StartKind = "table"  # resting on the table, overhanging its edge, or held out in mid-air
+    table_edge: TableEdge | None = None  # where the table must end; None: it may reach anywhere
+    first_drawn_frame: int = 0  # before it the object may hang in the air (start "held")
+    source: Literal["synthesised", "graspxl"] = "synthesised"

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from PIL import Image
 
 from datagen.objects.mesh import ObjectMesh
-from datagen.objects.surface import linear_from_srgb, sample_surface
+from datagen.objects.surface import sample_surface
 
 __all__ = ["TextureQuality", "measure_texture_quality"]
 

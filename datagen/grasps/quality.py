@@ -1,0 +1,141 @@
+"""Figures of a simulated motion, measured on the skinned hand and the object's own mesh."""
+
+import igl
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from datagen.grasps.config import GraspConfig
+from datagen.grasps.hand_body import HandBody
+from datagen.grasps.sequence import GraspQuality, GraspSequence
+from datagen.grasps.simulation import Failure, MotionTrace
+from datagen.hands.model import PosedHand, ShapedHand, pose_hand
+from datagen.objects.asset import ObjectAsset
+
+__all__ = ["ObjectSurface", "hand_center", "measured_instants", "penetration_depths", "rejection"]
+
+INSTANTS = 24  # of the carried motion; the approach gets a few more
+CONTACT_N = 0.05
+FINGER_MIDDLE_JOINTS = [2, 5, 8, 11]  # PIP
+THUMB_TIP = 16  # row of PosedHand.joints_world
+
+
+class ObjectSurface:
+    """Signed distance to the object's own mesh, or to its solid where the mesh is open."""
+
+    def __init__(self, obj: ObjectAsset) -> None:
+        source = obj.mesh if obj.solid.watertight_source else obj.solid
+        self.verts = np.ascontiguousarray(source.verts_obj, dtype=np.float64)
+        self.faces = np.ascontiguousarray(source.faces, dtype=np.int64)
+        self.low, self.high = self.verts.min(0), self.verts.max(0)
+
+    def depth(self, points_obj: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
+        """How deep each point lies inside (m); 0 outside. Generalised winding number for the sign."""
+        depth = np.zeros(len(points_obj))
+        near = ((points_obj > self.low) & (points_obj < self.high)).all(1)
+        if near.any():
+            signed = igl.signed_distance(
+                np.ascontiguousarray(points_obj[near]),
+                self.verts,
+                self.faces,
+                igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
+            )[0]
+            depth[near] = np.maximum(-signed, 0.0)
+        return depth
+
+
+def measured_instants(grasp_frame: int, frames: int) -> Int[np.ndarray, "instant"]:
+    """Frames at which penetration is measured: the whole motion, most of them while carried."""
+    before = np.linspace(0, grasp_frame, 7)[1:-1]
+    carried = np.linspace(grasp_frame, frames - 1, INSTANTS)
+    return np.unique(np.concatenate([before, carried]).round().astype(int))
+
+
+def pose_at(hand: ShapedHand, sequence: GraspSequence, rows: Int[np.ndarray, "instant"]) -> PosedHand:
+    """The skinned hand at some frames of a sequence."""
+    return pose_hand(
+        hand,
+        orientation_world=sequence.hand_orientation_world[rows],
+        hand_pose=sequence.hand_pose[rows],
+        translation_world=sequence.hand_translation_world[rows],
+        flat_hand_mean=sequence.flat_hand_mean,
+    )
+
+
+def penetration_depths(
+    surface: ObjectSurface,
+    verts_world: Float[np.ndarray, "instant vert 3"],
+    T_world_from_obj: Float[np.ndarray, "instant 4 4"],
+) -> Float[np.ndarray, "instant vert"]:
+    """Depth of every hand vertex inside the object (m)."""
+    R, t = T_world_from_obj[:, :3, :3], T_world_from_obj[:, :3, 3]
+    verts_obj = np.einsum("tvi,tij->tvj", verts_world - t[:, None], R)
+    return surface.depth(verts_obj.reshape(-1, 3)).reshape(verts_world.shape[:2])
+
+
+def hand_center(posed: PosedHand) -> Float[np.ndarray, "instant 3"]:
+    """GraspXL's hand centre: halfway between the thumb tip and the fingers' middle joints."""
+    fingers = posed.joints_world[:, FINGER_MIDDLE_JOINTS].mean(1)
+    return 0.5 * (fingers + posed.joints_world[:, THUMB_TIP])
+
+
+def measure_quality(
+    hand: ShapedHand,
+    surface: ObjectSurface,
+    sequence: GraspSequence,
+    trace: MotionTrace,
+    com_obj: Float[np.ndarray, "3"],
+) -> tuple[GraspQuality, PosedHand]:
+    """Quality of a motion (attempts still 0) and the posed hand at the measured instants."""
+    rows = measured_instants(trace.grasp_frame, len(trace.angles_rad))
+    posed = pose_at(hand, sequence, rows)
+    depth = penetration_depths(surface, posed.verts_world, trace.T_world_from_obj[rows])
+    com_world = trace.T_world_from_obj[:, :3, :3] @ com_obj + trace.T_world_from_obj[:, :3, 3]
+    com_hand = np.einsum("tji,tj->ti", trace.R_world_from_hand, com_world - trace.wrist_position_world)
+    lifting = com_hand[trace.grasp_frame : trace.lifted_frame] - com_hand[trace.grasp_frame]
+    turning = com_hand[trace.lifted_frame :] - com_hand[trace.lifted_frame]
+    end = trace.T_world_from_obj[-1, :3, 3]
+    quality = GraspQuality(
+        rise_m=float(end[2] - trace.T_world_from_obj[0, 2, 3]),
+        center_distance_m=float(np.linalg.norm(hand_center(posed)[-1] - end)),
+        max_penetration_m=float(depth.max()),
+        digits_in_contact=int((trace.force_n[-1, :5] > CONTACT_N).sum()),
+        slip_lift_m=float(np.linalg.norm(lifting, axis=1).max()),
+        slip_manipulation_m=float(np.linalg.norm(turning, axis=1).max()),
+        contact_force_n=float(trace.force_n[-1].sum()),
+        attempts=0,
+    )
+    return quality, posed
+
+
+def rejection(
+    quality: GraspQuality, sequence: GraspSequence, rotation_range_rad: float, config: GraspConfig
+) -> Failure | None:
+    """The first rule a motion breaks, or None: GraspXL's two, then contact, depth and slip."""
+    rules = (
+        (quality.rise_m > config.min_rise_m, Failure.NOT_RISEN),
+        (quality.center_distance_m < config.max_center_distance_m, Failure.OFF_CENTER),
+        (quality.digits_in_contact >= config.min_digits, Failure.FEW_DIGITS),
+        (sequence.contact_force_n[-1, 0] > CONTACT_N, Failure.FEW_DIGITS),  # the thumb opposes
+        (quality.max_penetration_m <= config.max_penetration_m, Failure.PENETRATION),
+        (quality.slip_lift_m <= config.max_slip_m, Failure.SLIP),
+        (quality.slip_manipulation_m <= config.max_slip_m, Failure.SLIP),
+        (rotation_range_rad >= config.min_movement_rad, Failure.NO_MOVEMENT),
+    )
+    return next((failure for passed, failure in rules if not passed), None)
+
+
+def below_table(
+    posed: PosedHand, sequence: GraspSequence, body: HandBody, config: GraspConfig
+) -> Bool[np.ndarray, "instant"]:
+    """Instants at which skin or forearm sinks into the table by more than 2 mm."""
+    wrist = posed.T_world_from_joint[:, 0]
+    axis = wrist[:, :3, :3] @ body.distal
+    back = np.linspace(2.0 * config.forearm_radius_m, config.forearm_length_m - config.forearm_radius_m, 4)
+    forearm = wrist[:, None, :3, 3] - back[:, None] * axis[:, None]
+    forearm = forearm - [0.0, 0.0, config.forearm_radius_m]
+    points = np.concatenate([posed.verts_world, forearm], 1)
+    sunk = points[..., 2] < -0.002
+    if sequence.table_edge is not None:
+        beyond = (points[..., :2] - sequence.table_edge.point_xy_m) @ np.array(sequence.table_edge.outward_xy)
+        sunk &= beyond < -0.002
+    return sunk.any(1)

@@ -1,0 +1,7 @@
+"""Errors of this package."""
+
+__all__ = ["SamplingError"]
+
+
+class SamplingError(ValueError):
+    """No scene could be drawn for a motion; the message has the figures and what to change."""

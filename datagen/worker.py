@@ -1,0 +1,188 @@
+"""One motion from grasp to staged rows, in one process: `python -m datagen.worker`.
+
+Everything here is a pure function of configuration and motion index; device and thread
+count change nothing but the time (and the last bits of a colour).
+"""
+
+import argparse
+import shutil
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.annotate import MotionAnnotator
+from datagen.child import die_with_parent, emit, run_child
+from datagen.config import DatasetConfig, load_config
+from datagen.grasps.synthesise import synthesise_grasp
+from datagen.hands.model import load_open_hand, shape_hand
+from datagen.library import open_library
+from datagen.objects.asset import ObjectAsset
+from datagen.objects.fields import learning_targets
+from datagen.pack import RenderRecord, clip_row, frame_row, object_row
+from datagen.plan import MotionPlan, read_plan
+from datagen.sampling.motion import SampledMotion, sample_scene
+from datagen.sampling.streams import Stream, stream_rng
+from datagen.scene_file import save_scene
+from datagen.timing import PhaseTimer
+from shards.images import encode_rgb_file
+from shards.schema import ClipRow, FrameRow
+from shards.writer import StagedClip, skip_motion, stage_motion
+
+__all__ = ["main"]
+
+RENDER_SCRIPT = Path(__file__).resolve().parent.parent / "blender_scripts" / "render_scene.py"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """What one worker process is asked to do."""
+
+    config: DatasetConfig
+    motion: MotionPlan
+    out: Path
+    device: str
+    threads: int
+
+    @property
+    def work_dir(self) -> Path:
+        return self.out / "staging" / f"shard-{self.motion.shard:05d}" / f"{self.motion.motion_id}.work"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Render and stage one motion; progress as JSON lines on standard output."""
+    parser = argparse.ArgumentParser(prog="python -m datagen.worker", description=main.__doc__)
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--motion", type=int, required=True)
+    parser.add_argument("--device", required=True)
+    parser.add_argument("--threads", type=int, required=True)
+    options = parser.parse_args(arguments)
+    die_with_parent()
+    job = Job(
+        config=load_config(options.config),
+        motion=read_plan(options.out / "plan.parquet").motions[options.motion],
+        out=options.out,
+        device=options.device,
+        threads=options.threads,
+    )
+    run_job(job)
+
+
+def run_job(job: Job) -> None:
+    """Grasp, scene, pictures, annotations, rows. What cannot be made is staged as skipped, with the reason."""
+    timer = PhaseTimer()
+    shard, index = job.motion.shard, job.motion.motion_index
+    emit(phase="grasp", done=0, total=1)
+    with timer.phase("object"):
+        asset = open_library(job.config.objects).load(job.motion.object_uid)
+    try:
+        sampled = _sampled_motion(job, asset, timer)
+    except (GraspNotFoundError, SamplingError) as error:
+        stage_skipped_motion(
+            job.out, shard, index, reason=str(error), timings_s=timer.seconds, provenance=job.provenance
+        )
+        emit(phase="skipped", done=1, total=1)
+        return
+    job.work_dir.mkdir(parents=True, exist_ok=True)
+    record = _rendered(job, sampled, timer)
+    with timer.phase("targets"):
+        targets = learning_targets(asset, job.config.seed, job.config.targets)
+    clips, frames = _rows(job, sampled, record, timer)
+    stage_motion(
+        job.out,
+        shard,
+        index,
+        object_row=object_row(asset, targets),
+        clips=clips,
+        frames=frames,
+        timings_s=timer.seconds,
+        provenance=job.provenance,
+    )
+    shutil.rmtree(job.work_dir)
+    emit(phase="done", done=1, total=1)
+
+
+def _sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledMotion:
+    """Draw hand shape, grasp and scene, each from its own stream of this motion's seed."""
+    seed, index = job.config.seed, job.motion.motion_index
+    with timer.phase("grasp"):
+        betas = sample_betas(stream_rng(seed, index, Stream.HAND_SHAPE), job.config.sampling.appearance)
+        shaped = shape_hand(load_open_hand(), betas)
+        sequence = synthesise_grasp(shaped, asset, job.config.grasp, stream_rng(seed, index, Stream.GRASP))
+    emit(phase="scene", done=0, total=1)
+    with timer.phase("scene"):
+        return sample_scene(
+            sequence,
+            shaped,
+            asset,
+            job.config.sampling,
+            dataset_seed=seed,
+            motion_index=index,
+            motion_id=job.motion.motion_id,
+        )
+
+
+def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderRecord:
+    """Let Blender render what is missing of this motion's pictures."""
+    scene_path = job.work_dir / "scene.npz"
+    save_scene(sampled.scene, scene_path)
+    n_frames, n_cameras = len(sampled.scene.T_world_from_obj), len(sampled.scene.cameras)
+    camera_seconds = np.zeros(n_cameras)
+    summary: dict[str, Any] = {}
+    done = 0
+
+    def on_event(event: dict[str, Any]) -> None:
+        nonlocal done
+        if event["event"] == "frame":
+            done += 1
+            camera_seconds[event["camera"]] += sum(event["seconds"].values())
+            emit(phase="render", done=done, total=n_cameras * n_frames)
+        elif event["event"] == "done":
+            summary.update(event)
+
+    command = [sys.executable, str(RENDER_SCRIPT), "--scene", str(scene_path), "--frames-dir", str(job.work_dir)]
+    command += ["--device", job.device, "--threads", str(job.threads)]
+    with timer.phase("blender"):
+        run_child(command, log=job.work_dir / "blender.log", on_event=on_event)
+    for phase, seconds in summary["seconds"].items():
+        timer.add(f"blender.{phase}", seconds)
+    return RenderRecord(
+        engine_version=summary["blender"],
+        device=summary["device"],
+        denoiser=summary["denoiser"],
+        seconds_per_camera=tuple(camera_seconds.tolist()),
+    )
+
+
+def _rows(
+    job: Job, sampled: SampledMotion, record: RenderRecord, timer: PhaseTimer
+) -> tuple[list[ClipRow], list[FrameRow]]:
+    """Annotate every picture and encode it; rows run camera by camera, frame by frame."""
+    n_frames, n_cameras = len(sampled.scene.T_world_from_obj), len(sampled.scene.cameras)
+    geometry = MotionGeometry(sampled.scene)
+    distances_m = hand_object_distances(sampled.scene)
+    rows: list[list[FrameRow]] = [[] for _ in range(n_cameras)]
+    for frame in range(n_frames):
+        with timer.phase("annotate"):
+            annotated = annotate_frame(geometry, frame)
+        with timer.phase("pack"):
+            for camera, buffers in enumerate(annotated):
+                png = job.work_dir / f"cam-{camera:02d}" / f"frame-{frame:04d}.png"
+                rgb = encode_rgb(png.read_bytes(), job.config.shard)
+                rows[camera].append(
+                    frame_row(job.motion, sampled, camera, frame, buffers, distances_m[frame], rgb, job.config.shard)
+                )
+        emit(phase="annotate", done=(frame + 1) * n_cameras, total=n_frames * n_cameras)
+    clips = [
+        clip_row(job.motion, sampled, camera, rows[camera], record, job.config.shard, job.config.seed)
+        for camera in range(n_cameras)
+    ]
+    return clips, [row for camera_rows in rows for row in camera_rows]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,238 @@
+"""Read a dataset from a folder or any fsspec URL: only finished shards, only the columns asked for.
+
+Everything is verified on the way: each JSON record by its own hash, each Parquet footer by the
+hash and each column chunk by the CRC in shard.json. Damage raises a ShardError, never wrong data.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import numpy as np
+import pyarrow as pa
+
+from shards.array_types import UInt8
+from shards.columns import arrow_schema, column_values, columns_of, rows_from_table
+from shards.errors import (
+    CorruptShardError,
+    DatasetNotFoundError,
+    ImageError,
+    MissingColumnError,
+    StorageError,
+)
+from shards.images import Geometry, Masks, decode_geometry, decode_masks, decode_rgb
+from shards.parquet import COPY_AGAIN, ParquetSource
+from shards.records import DatasetRecord, ShardRecord, parse_record
+from shards.schema import ROW_TYPES, ClipRow, FrameRow, ObjectRow
+
+__all__ = ["Dataset", "Frame", "Frames", "Shard", "Table", "open_dataset", "open_shard"]
+
+
+class Table:
+    """Some columns of some rows, as arrays. `table["K"]` has shape (row, 3, 3).
+
+    Scalars of type text or bytes come as a list, columns of varying length as a list of arrays.
+    A column that was not read raises MissingColumnError.
+    """
+
+    def __init__(self, arrow: pa.Table, row_type: type, *, where: str) -> None:
+        self.arrow = arrow
+        self.where = where
+        self._columns = {c.name: c for c in columns_of(row_type)}
+
+    def __len__(self) -> int:
+        return int(self.arrow.num_rows)
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self.arrow.column_names:
+            known = name in self._columns
+            problem = "this column was not read" if known else "no such column"
+            fix = f"add '{name}' to columns=[...]" if known else "see the tables in shards/README.md"
+            raise MissingColumnError(
+                problem, where=self.where, column=name, found=self.arrow.column_names, fix=fix
+            )
+        column = self._columns[name]
+        values = column_values(self.arrow[name], column)
+        is_number = not column.shape and column.dtype not in ("string", "binary")
+        return np.array(values, column.dtype) if is_number else values
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Frame:
+    """One frame, decoded."""
+
+    row: FrameRow
+    rgb: UInt8[np.ndarray, "height width 3"]
+    masks: Masks
+    geometry: Geometry
+
+
+class Frames(Table):
+    """Frames of one clip in time order; images are decoded when asked for, `index` is the frame."""
+
+    def __init__(self, arrow: pa.Table, *, where: str) -> None:
+        super().__init__(arrow, FrameRow, where=where)
+
+    def rgb(self, index: int) -> UInt8[np.ndarray, "height width 3"]:
+        return self._decoded("rgb", index, decode_rgb)
+
+    def masks(self, index: int) -> Masks:
+        return self._decoded("masks", index, decode_masks)
+
+    def geometry(self, index: int) -> Geometry:
+        return self._decoded("geometry", index, decode_geometry)
+
+    def frame(self, index: int) -> Frame:
+        """Everything about one frame; needs all columns."""
+        for field in fields(FrameRow):
+            if field.name not in self.arrow.column_names:
+                self[field.name]  # raises
+        (row,) = rows_from_table(self.arrow.slice(index, 1), FrameRow)
+        return Frame(row=row, rgb=self.rgb(index), masks=self.masks(index), geometry=self.geometry(index))
+
+    def _decoded(self, column: str, index: int, decode: Any) -> Any:
+        if column not in self.arrow.column_names:
+            self[column]  # raises
+        try:
+            return decode(self.arrow[column][index].as_py())
+        except ImageError as error:
+            raise ImageError(str(error), where=self.where, row=f"frame {index}", column=column) from error
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Shard:
+    """One finished shard. Can be pickled to other processes; holds no open file."""
+
+    fs: fsspec.AbstractFileSystem
+    path: str
+    record: ShardRecord
+
+    def clips(self) -> list[ClipRow]:
+        """All clips, in file order."""
+        return self._rows("clips", ClipRow)
+
+    def objects(self) -> list[ObjectRow]:
+        """All objects with meshes and samples; `read_objects` reads single columns."""
+        return self._rows("objects", ObjectRow)
+
+    def read_clips(self, columns: Sequence[str]) -> Table:
+        """The named columns of all clips."""
+        return self._table("clips", columns)
+
+    def read_objects(self, columns: Sequence[str]) -> Table:
+        """The named columns of all objects."""
+        return self._table("objects", columns)
+
+    def read_frames(self, clip_id: str, columns: Sequence[str] | None = None) -> Frames:
+        """The frames of one clip; only `columns` are fetched (None: all)."""
+        if clip_id not in self.record.clip_ids:
+            raise DatasetNotFoundError("no such clip", where=self.path, found=clip_id)
+        group = self.record.clip_ids.index(clip_id)
+        source = self._sources["frames"]
+        where = f"{source.path}, clip {clip_id}"
+        wanted = None if columns is None else list(dict.fromkeys(["clip_id", *columns]))
+        table = source.read_row_group(group, wanted)
+        if table["clip_id"].unique().to_pylist() != [clip_id]:
+            raise CorruptShardError(
+                "row group of another clip", where=where, row=f"group {group}", fix=COPY_AGAIN
+            )
+        return Frames(table, where=where)
+
+    def source(self, name: str) -> ParquetSource:
+        """The file behind "objects", "clips" or "frames"."""
+        return self._sources[name]
+
+    def _rows(self, name: str, row_type: type) -> list[Any]:
+        return rows_from_table(self._table(name, None).arrow, row_type)
+
+    def _table(self, name: str, columns: Sequence[str] | None) -> Table:
+        source = self._sources[name]
+        groups = [source.read_row_group(i, columns) for i in range(source.num_row_groups)]
+        empty = arrow_schema(ROW_TYPES[name]).empty_table()
+        return Table(pa.concat_tables(groups) if groups else empty, ROW_TYPES[name], where=source.path)
+
+    @cached_property
+    def _sources(self) -> dict[str, ParquetSource]:
+        return {
+            name: ParquetSource(
+                fs=self.fs, path=f"{self.path}/{name}.parquet", record=self.record.files[f"{name}.parquet"]
+            )
+            for name in ROW_TYPES
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Dataset:
+    """A dataset at any fsspec location."""
+
+    fs: fsspec.AbstractFileSystem
+    path: str
+    record: DatasetRecord
+    shards: tuple[Shard, ...]  # finished ones, in order
+
+    def clips(self) -> Iterator[ClipRow]:
+        """All clips of all finished shards."""
+        for shard in self.shards:
+            yield from shard.clips()
+
+    def objects(self) -> Iterator[ObjectRow]:
+        """All objects, each once."""
+        seen: set[str] = set()
+        for shard in self.shards:
+            for row in shard.objects():
+                if row.object_uid not in seen:
+                    seen.add(row.object_uid)
+                    yield row
+
+    def read_frames(self, clip_id: str, columns: Sequence[str] | None = None) -> Frames:
+        """The frames of one clip; only `columns` are fetched (None: all)."""
+        try:
+            shard = self._shard_of_clip[clip_id]
+        except KeyError:
+            raise DatasetNotFoundError("no such clip", where=self.path, found=clip_id) from None
+        return shard.read_frames(clip_id, columns)
+
+    @cached_property
+    def _shard_of_clip(self) -> dict[str, Shard]:
+        return {clip_id: shard for shard in self.shards for clip_id in shard.record.clip_ids}
+
+
+def open_dataset(url: str | Path, *, shards: Sequence[int] | None = None) -> Dataset:
+    """Open a dataset folder, local or remote ("s3://...", "https://...", "memory://...").
+
+    `shards` names the shards to open, needed where a server cannot list folders; None takes every
+    finished one. Raises DatasetNotFoundError, SchemaVersionError, CorruptShardError.
+    """
+    fs, root = fsspec.core.url_to_fs(str(url))
+    root = root.rstrip("/")
+    record = parse_record(_read(fs, f"{root}/dataset.json"), DatasetRecord, where=f"{url}/dataset.json")
+    if shards is None:
+        found = sorted(str(path) for path in fs.glob(f"{root}/shards/shard-*/shard.json"))
+        paths = [path.removesuffix("/shard.json") for path in found]
+    else:
+        paths = [f"{root}/shards/shard-{shard:05d}" for shard in shards]
+    return Dataset(fs=fs, path=str(url), record=record, shards=tuple(_shard(fs, path) for path in paths))
+
+
+def open_shard(url: str | Path) -> Shard:
+    """Open one shard folder by itself."""
+    fs, path = fsspec.core.url_to_fs(str(url))
+    return _shard(fs, path.rstrip("/"))
+
+
+def _shard(fs: fsspec.AbstractFileSystem, path: str) -> Shard:
+    where = f"{path}/shard.json"
+    return Shard(fs=fs, path=path, record=parse_record(_read(fs, where), ShardRecord, where=where))
+
+
+def _read(fs: fsspec.AbstractFileSystem, path: str) -> bytes:
+    try:
+        return fs.cat_file(path)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        fix = "check the address; a shard without its shard.json is unfinished"
+        raise DatasetNotFoundError("no such file", where=path, fix=fix) from error
+    except OSError as error:
+        raise StorageError(f"cannot be read: {error}", where=path) from error

@@ -1,0 +1,169 @@
+"""Does a finished shard hold what it says, and do its numbers agree with each other?
+
+`verify_shard` reads everything once: file hashes, rows, every image, and the invariants that
+tie masks, depth, boxes, joints, poses, splits and object samples together (`invariants.py`).
+It collects findings instead of stopping at the first.
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from shards.errors import MissingColumnError, ShardError
+from shards.invariants import clip_problems, frame_problems, object_problems
+from shards.reader import Dataset, Frames, Shard, open_dataset
+from shards.schema import ROW_TYPES, ClipRow
+from shards.splits import SplitRule
+
+__all__ = ["Finding", "ShardReport", "verify_dataset", "verify_shard"]
+
+Progress = Callable[[int, int], None]  # clips done, clips in all
+_BLOCK = 1 << 22
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding:
+    """One thing that is wrong, and where."""
+
+    where: str
+    problem: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.problem}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShardReport:
+    """What was looked at and what was found."""
+
+    path: str
+    n_objects: int
+    n_clips: int
+    n_frames: int
+    n_bytes: int
+    skipped: tuple[str, ...]  # "motion 12: reason"
+    findings: tuple[Finding, ...]
+
+    @property
+    def ok(self) -> bool:
+        return not self.findings
+
+
+def verify_dataset(url: str | Path) -> Iterator[ShardReport]:
+    """The report of every finished shard, in order. Raises ShardError when the dataset cannot be opened."""
+    dataset: Dataset = open_dataset(url)
+    for shard in dataset.shards:
+        yield verify_shard(shard, split_rule=dataset.record.split_rule)
+
+
+def verify_shard(
+    shard: Shard, *, split_rule: SplitRule | None, progress: Progress | None = None
+) -> ShardReport:
+    """Check everything about one shard; `split_rule` None leaves the splits unchecked."""
+    findings = list(_file_findings(shard))
+    rows = {name: record.rows for name, record in shard.record.files.items()}
+    n_frames = 0
+    if not findings:  # damaged files are reported once, not again by every row
+        findings += _object_findings(shard)
+        clips = shard.clips()
+        uids = set(shard.read_objects(["object_uid"])["object_uid"])
+        if [clip.clip_id for clip in clips] != list(shard.record.clip_ids):
+            findings.append(_finding(shard, "clips.parquet and shard.json list different clips"))
+        for done, clip in enumerate(clips):
+            if progress:
+                progress(done, len(clips))
+            clip_findings, clip_frames = _clip_findings(shard, clip, uids, split_rule)
+            findings += clip_findings
+            n_frames += clip_frames
+        if progress:
+            progress(len(clips), len(clips))
+        if n_frames != rows["frames.parquet"]:
+            findings.append(
+                _finding(shard, f"frames: expected {rows['frames.parquet']} rows, found {n_frames}")
+            )
+    return ShardReport(
+        path=shard.path,
+        n_objects=rows.get("objects.parquet", 0),
+        n_clips=len(shard.record.clip_ids),
+        n_frames=n_frames,
+        n_bytes=sum(record.n_bytes for record in shard.record.files.values()),
+        skipped=tuple(f"motion {m.motion_index}: {m.skip_reason}" for m in shard.record.skipped),
+        findings=tuple(findings),
+    )
+
+
+def _finding(shard: Shard, problem: str, *where: str) -> Finding:
+    return Finding(where=", ".join((shard.path, *where)), problem=problem)
+
+
+def _file_findings(shard: Shard) -> Iterator[Finding]:
+    """Whole-file hashes and the presence of every column of the schema."""
+    for name, row_type in ROW_TYPES.items():
+        file_name = f"{name}.parquet"
+        if file_name not in shard.record.files:
+            yield _finding(shard, "not listed in shard.json", file_name)
+            continue
+        try:
+            problem = _hash_problem(shard, file_name) or _schema_problem(shard, name, row_type)
+        except (ShardError, OSError) as error:
+            problem = str(error)
+        if problem:
+            yield _finding(shard, problem, file_name)
+
+
+def _hash_problem(shard: Shard, file_name: str) -> str:
+    record, digest, n_bytes = shard.record.files[file_name], hashlib.sha256(), 0
+    with shard.fs.open(f"{shard.path}/{file_name}", "rb") as file:
+        while block := file.read(_BLOCK):
+            digest.update(block)
+            n_bytes += len(block)
+    if n_bytes != record.n_bytes:
+        return f"expected {record.n_bytes} bytes, found {n_bytes}"
+    return "" if digest.hexdigest() == record.sha256 else "the content does not match its SHA-256"
+
+
+def _schema_problem(shard: Shard, name: str, row_type: type) -> str:
+    source = shard.source(name)
+    rows = shard.record.files[f"{name}.parquet"].rows
+    if source.metadata.num_rows != rows:
+        return f"expected {rows} rows, found {source.metadata.num_rows}"
+    try:
+        source.check_columns(row_type)
+    except MissingColumnError as error:
+        return str(error)
+    return ""
+
+
+def _object_findings(shard: Shard) -> list[Finding]:
+    findings = []
+    for row in shard.objects():
+        findings += [_finding(shard, problem, f"object {row.object_uid}") for problem in object_problems(row)]
+    return findings
+
+
+def _clip_findings(
+    shard: Shard, clip: ClipRow, uids: set[str], split_rule: SplitRule | None
+) -> tuple[list[Finding], int]:
+    frames = shard.read_frames(clip.clip_id)
+    problems = clip_problems(clip, frames, split_rule)
+    if clip.object_uid not in uids:
+        problems.append(f"object {clip.object_uid} is not in objects.parquet")
+    problems += _frame_problems(frames, clip)
+    return [_finding(shard, problem, f"clip {clip.clip_id}") for problem in problems], len(frames)
+
+
+def _frame_problems(frames: Frames, clip: ClipRow) -> list[str]:
+    """Each problem once per clip, with the frames that have it."""
+    seen: dict[str, list[int]] = {}
+    for index in range(len(frames)):
+        try:
+            problems = frame_problems(frames.frame(index), clip)
+        except ShardError as error:
+            problems = [str(error)]
+        for problem in problems:
+            seen.setdefault(problem, []).append(index)
+    return [
+        f"{problem} (frames {', '.join(map(str, indices[:8]))}{' ...' if len(indices) > 8 else ''})"
+        for problem, indices in seen.items()
+    ]
