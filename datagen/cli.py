@@ -2,21 +2,27 @@
 
 import functools
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 from rich.console import Console
+from rich.progress import Progress
 
 from datagen.config import load_config
+from datagen.inspection.plan_table import plan_table
+from datagen.inspection.sheet import contact_sheet, write_png
+from datagen.inspection.summary import shard_line, shard_summary
+from datagen.inspection.video import write_video
 from datagen.objects.errors import ObjectError
 from datagen.pipeline import PipelineError, RenderOptions, plan_dataset, render_shard
 from datagen.plan import PlanError
 from datagen.render_progress import RenderProgress
-from datagen.version import generator_commit
 from shards.errors import ShardError
+from shards.reader import Shard, open_dataset, open_shard
 from shards.settings import SettingsError
+from shards.verify import ShardReport, verify_shard
 
 __all__ = ["main"]
 
@@ -76,12 +82,10 @@ def plan(config_path: Path, out: Path | None) -> None:
     Example:
       datagen plan --config configs/datagen/paper.yaml --out data/paper
     """
-    from datagen.inspection.plan_table import plan_table
-
     config = load_config(config_path)
     out = out or default_out(config_path)
-    made = plan_dataset(config, out, commit=generator_commit())
-    Console().print(plan_table(made, config, out))
+    made = plan_dataset(config, out)
+    Console().print(plan_table(made, out))
 
 
 @main.command()
@@ -107,14 +111,110 @@ def render(config_path: Path, out: Path | None, shard: int, device: str, workers
     """
     config = load_config(config_path)
     out = out or default_out(config_path)
-    made = plan_dataset(config, out, commit=generator_commit())
+    made = plan_dataset(config, out)
     options = RenderOptions(device=device, workers=workers, threads_per_worker=threads)
     with RenderProgress(made.shard(shard)) as progress:
-        summary = render_shard(config_path, config, made, out, shard, options, progress.update)
-    click.echo(summary.one_line())
+        record = render_shard(config_path, config, made, out, shard, options, progress.update)
+    click.echo(shard_line(record, out))
     click.echo(f"look at it: datagen inspect shard {shard} --out {out} --sheet sheet.png")
+
+
+@main.group()
+def inspect() -> None:
+    """Look at what was rendered.
+
+    \b
+    Example:
+      datagen inspect shard 0 --sheet sheet.png
+    """
+
+
+@inspect.command("shard")
+@click.argument("shard")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("data/tiny"),
+    show_default=True,
+    help="Dataset folder, when the shard is given by its number.",
+)
+@click.option("--sheet", type=click.Path(path_type=Path, dir_okay=False), help="Write a contact sheet (PNG).")
+@click.option("--clips", type=click.IntRange(min=1), default=8, show_default=True, help="Clips on the sheet.")
+@click.option("--frames", type=click.IntRange(min=1), default=6, show_default=True, help="Moments of each clip.")
+@click.option("--tile", type=click.IntRange(min=64), default=256, show_default=True, help="Tile width in pixels.")
+@click.option("--video", type=click.Path(path_type=Path, dir_okay=False), help="Write one clip as MP4.")
+@click.option("--clip", "clip_id", default=None, help="Clip of the video.  [default: the first]")
+@plain_errors
+def inspect_shard(
+    shard: str,
+    out: Path,
+    sheet: Path | None,
+    clips: int,
+    frames: int,
+    tile: int,
+    video: Path | None,
+    clip_id: str | None,
+) -> None:
+    """Print what SHARD (a number, or a path) holds; draw it with its labels.
+
+    \b
+    Example:
+      datagen inspect shard 0 --sheet sheet.png --video clip.mp4
+    """
+    opened = _open(shard, out)
+    console = Console()
+    console.print(shard_summary(opened))
+    if sheet is not None:
+        write_png(sheet, contact_sheet(opened, n_clips=clips, n_frames=frames, tile_px=tile))
+        console.print(f"contact sheet: {sheet}")
+    if video is not None:
+        write_video(opened, clip_id or opened.record.clip_ids[0], video, repeats=4)
+        console.print(f"video: {video}")
+
+
+@main.command()
+@click.argument("path", type=click.Path(path_type=Path))
+@plain_errors
+def verify(path: Path) -> None:
+    """Check every byte and every number of a dataset or of one shard; exit status 1 when something is wrong.
+
+    \b
+    Example:
+      datagen verify data/tiny
+    """
+    bad = 0
+    for report in _verified(path):
+        state = "ok" if report.ok else f"{len(report.findings)} findings"
+        click.echo(
+            f"{report.path}: {report.n_objects} objects, {report.n_clips} clips, {report.n_frames} frames, "
+            f"{report.n_bytes / 1e6:.1f} MB, {len(report.skipped)} motions skipped: {state}"
+        )
+        for finding in report.findings:
+            click.echo(f"  {finding}")
+        bad += not report.ok
+    sys.exit(1 if bad else 0)
 
 
 def default_out(config_path: Path) -> Path:
     """Where the Makefile puts it too."""
     return Path("data") / config_path.stem
+
+
+def _open(shard: str, out: Path) -> Shard:
+    return open_shard(out / "shards" / f"shard-{int(shard):05d}" if shard.isdecimal() else shard)
+
+
+def _verified(path: Path) -> Iterator[ShardReport]:
+    """Reports of a whole dataset or of one shard of it, with a bar on standard error."""
+    is_shard = (path / "shard.json").exists()
+    rule = None if is_shard else open_dataset(path).record.split_rule
+    shards = [open_shard(path)] if is_shard else open_dataset(path).shards
+    if not shards:
+        raise ShardError("no finished shard", where=str(path), fix="render one: datagen render --shard 0")
+    console = Console(stderr=True)
+    for shard in shards:
+        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+            task = bar.add_task(f"verifying shard {shard.record.shard}", total=None)
+            yield verify_shard(
+                shard, split_rule=rule, progress=lambda done, total: bar.update(task, completed=done, total=total)
+            )

@@ -6,9 +6,8 @@ them, reads the YAML strictly and compares configurations.
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import yaml
 
@@ -21,7 +20,7 @@ from datagen.sampling.config import SamplingConfig
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
 
-__all__ = ["DatasetConfig", "config_as_json", "config_hash", "load_config"]
+__all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,28 +51,13 @@ def load_config(path: Path) -> DatasetConfig:
     return settings_from_dict(DatasetConfig, data, where=str(path))
 
 
-def config_as_json(config: DatasetConfig) -> dict[str, Any]:
-    """The configuration as plain JSON values, as stored in dataset.json."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(config), default=str))
-    return plain
+def config_as_yaml(config: DatasetConfig) -> str:
+    """The complete configuration as it is stored in dataset.json; `load_config` reads it back."""
+    plain = json.loads(json.dumps(asdict(config), default=str))
+    return yaml.safe_dump(plain, sort_keys=False)
 
 
-def config_hash(config: DatasetConfig) -> str:
-    """Sixteen hex digits that change when any setting that decides the data changes.
-
-    Where assets and caches lie on this machine does not decide the data.
-    """
-    plain = config_as_json(config)
-    del plain["objects"]["cache_dir"]
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def first_difference(a: Any, b: Any, key: str = "") -> str:
-    """The first dotted key in which two JSON values differ, with both values; '' if none."""
-    if isinstance(a, dict) and isinstance(b, dict):
-        for name in sorted(a.keys() | b.keys()):
-            found = first_difference(a.get(name), b.get(name), f"{key}.{name}" if key else name)
-            if found:
-                return found
-        return ""
-    return "" if a == b else f"{key}: {a!r} there, {b!r} here"
+def config_sha256(config: DatasetConfig) -> str:
+    """Changes when any setting that decides the data changes; where assets and caches lie does not."""
+    placeless = replace(config, objects=replace(config.objects, path=None, cache_dir=None))
+    return hashlib.sha256(config_as_yaml(placeless).encode()).hexdigest()

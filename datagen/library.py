@@ -5,6 +5,8 @@ from pathlib import Path
 from typing import Literal
 
 from datagen.objects.library import MeshFolder, ObjectLibrary, StarterPack, Sweethome3D
+from datagen.objects.preparation import PreparationConfig
+from datagen.objects.reading import ReadingConfig
 
 __all__ = ["ObjectsConfig", "open_library"]
 
@@ -17,6 +19,17 @@ class ObjectsConfig:
 
     source: Literal["starter", "folder", "sweethome3d"]
     path: Path | None  # folder of meshes, or root of an unpacked Debian package; null: the default place
-    unit: Literal["auto", "m", "cm", "mm"]  # of unit-less files in a folder
-    cache_dir: Path | None  # convex parts and solids; null: ~/.cache/forehoi/objects
+    reading: ReadingConfig  # folder only
+    preparation: PreparationConfig  # folder and sweethome3d; the starter pack is prepared
+    cache_dir: Path | None  # solids and convex parts; null: ~/.cache/forehoi/objects
     exclude: tuple[str, ...]  # uids that are left out
+
+
+def open_library(config: ObjectsConfig) -> ObjectLibrary:
+    """The library that `config` names. Raises ObjectError when it is not there."""
+    cache_dir = (config.cache_dir or DEFAULT_CACHE).expanduser()
+    if config.source == "starter":
+        return StarterPack()
+    if config.source == "folder":
+        return MeshFolder(config.path or Path(), config.reading, config.preparation, cache_dir)
+    return Sweethome3D(config.path, config.preparation, cache_dir)

@@ -1,11 +1,13 @@
 """Scene + rendered frames + annotations -> shard rows."""
 
 import hashlib
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from PIL import Image
 
 from datagen.annotate import FrameGeometry
 from datagen.objects.asset import ObjectAsset
@@ -14,11 +16,11 @@ from datagen.objects.fields import LearningTargets
 from datagen.plan import MotionPlan
 from datagen.sampling.motion import SampledMotion
 from datagen.scene import SLEEVE
-from shards.geometry import camera_center, project_points, transform_points
-from shards.images import encode_geometry, encode_masks
+from shards.geometry import project_points, transform_points
+from shards.images import Geometry, decode_rgb, encode_geometry, encode_masks, encode_rgb_png
 from shards.schema import ClipRow, FrameRow, ObjectRow
 
-__all__ = ["RenderRecord", "ShardConfig", "clip_id_of", "clip_row", "frame_row", "object_row"]
+__all__ = ["RenderRecord", "ShardConfig", "clip_id_of", "clip_row", "encoded_rgb", "frame_row", "object_row"]
 
 # Licences that let us hand the mesh on; of all others the shard holds renders and targets only.
 REDISTRIBUTABLE = ("CC0-1.0", "CC-BY-3.0", "CC-BY-4.0", "Apache-2.0", "MIT", "BSD-3-Clause")
@@ -46,6 +48,16 @@ class RenderRecord:
 def clip_id_of(motion_id: str, camera_index: int) -> str:
     """`motion-000012` and camera 3 -> `motion-000012-cam-03`."""
     return f"{motion_id}-cam-{camera_index:02d}"
+
+
+def encoded_rgb(png: bytes, config: ShardConfig) -> bytes:
+    """A rendered PNG in the shard's codec. Blender's PNG is decoded once and packed again, smaller and reproducible."""
+    pixels = decode_rgb(png)
+    if config.rgb_codec == "png":
+        return encode_rgb_png(pixels)
+    stream = io.BytesIO()
+    Image.fromarray(pixels).save(stream, format=config.rgb_codec, quality=config.rgb_quality)
+    return stream.getvalue()
 
 
 def object_row(asset: ObjectAsset, targets: LearningTargets) -> ObjectRow:
@@ -161,6 +173,7 @@ def frame_row(
     camera_index: int,
     frame_index: int,
     geometry: FrameGeometry,
+    hand_object_distance_m: float,
     rgb: bytes,
     config: ShardConfig,
 ) -> FrameRow:
@@ -169,7 +182,7 @@ def frame_row(
     camera = scene.cameras[camera_index]
     T_cam_from_world = camera.T_cam_from_world[frame_index]
     joints_world = sampled.joints_world[frame_index]
-    figures = geometry.figures
+    hand, obj = geometry.hand, geometry.object
     return FrameRow(
         clip_id=clip_id_of(motion.motion_id, camera_index),
         frame_index=frame_index,
@@ -181,21 +194,22 @@ def frame_row(
         hand_translation_world=sampled.hand_translation_world[frame_index],
         joints_world=joints_world,
         joints_px=project_points(transform_points(T_cam_from_world, joints_world), camera.K),
-        hand_box_visible_px=figures.hand_box_visible_px,
-        hand_box_amodal_px=figures.hand_box_amodal_px,
-        object_box_visible_px=figures.object_box_visible_px,
-        object_box_amodal_px=figures.object_box_amodal_px,
-        hand_pixels_visible=figures.hand_pixels_visible,
-        hand_pixels_amodal=figures.hand_pixels_amodal,
-        object_pixels_visible=figures.object_pixels_visible,
-        object_pixels_amodal=figures.object_pixels_amodal,
-        hand_visible_fraction=figures.hand_visible_fraction,
-        object_visible_fraction=figures.object_visible_fraction,
+        hand_box_visible_px=hand.box_visible_px,
+        hand_box_amodal_px=hand.box_amodal_px,
+        object_box_visible_px=obj.box_visible_px,
+        object_box_amodal_px=obj.box_amodal_px,
+        hand_pixels_visible=hand.pixels_visible,
+        hand_pixels_amodal=hand.pixels_amodal,
+        object_pixels_visible=obj.pixels_visible,
+        object_pixels_amodal=obj.pixels_amodal,
+        hand_visible_fraction=hand.visible_fraction,
+        object_visible_fraction=obj.visible_fraction,
         contact_force_n=sampled.contact_force_n[frame_index],
-        hand_object_distance_m=geometry.hand_object_distance_m,
+        hand_object_distance_m=hand_object_distance_m,
         rgb=rgb,
         masks=encode_masks(geometry.masks),
         geometry=encode_geometry(
-            geometry.depth, geometry.depth_object, geometry.normals_cam, compression=config.depth_compression
+            Geometry(depth=geometry.depth, depth_object=geometry.depth_object, normals_cam=geometry.normals_cam),
+            compression=config.depth_compression,
         ),
     )

@@ -14,17 +14,19 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from datagen.child import ChildError, run_child
-from datagen.config import DatasetConfig, config_as_json, config_hash, first_difference
+from datagen.config import DatasetConfig, config_as_yaml, config_sha256
 from datagen.library import open_library
-from datagen.plan import Plan, make_plan, read_plan, same_plan, write_plan
-from shards.dataset import DatasetInfo, read_dataset_info, write_dataset_info
-from shards.writer import ShardSummary, commit_shard, is_motion_staged, is_shard_committed
+from datagen.plan import PLAN_FILE, Plan, make_plan, read_plan, same_plan, write_plan
+from datagen.version import generator_commit
+from shards.records import DatasetRecord, Provenance, ShardRecord
+from shards.schema import CONVENTIONS, SCHEMA_VERSION
+from shards.writer import begin_dataset, commit_shard, is_motion_staged, is_shard_committed
 
-__all__ = ["PipelineError", "Progress", "RenderOptions", "plan_dataset", "render_shard"]
+__all__ = ["PipelineError", "Progress", "RenderOptions", "plan_dataset", "provenance_of", "render_shard"]
 
-PLAN_FILE = "plan.parquet"
 
 
 class PipelineError(RuntimeError):
@@ -44,16 +46,21 @@ class RenderOptions:
 class Progress:
     """One step of one motion."""
 
-    motion_id: str
+    motion_index: int
     phase: str  # staged, grasp, scene, render, annotate, done, skipped
     done: int
     total: int
 
 
-def plan_dataset(config: DatasetConfig, out: Path, *, commit: str) -> Plan:
-    """Write dataset.json and plan.parquet, or return the plan that is there when it is the same.
+def provenance_of(config: DatasetConfig) -> Provenance:
+    """What made the data: this code and this configuration."""
+    return Provenance(generator_commit=generator_commit(), config_sha256=config_sha256(config))
 
-    PipelineError when `out` holds a dataset of another configuration.
+
+def plan_dataset(config: DatasetConfig, out: Path) -> Plan:
+    """Write dataset.json and plan.parquet, or check that those which are there say the same.
+
+    ShardError when `out` holds a dataset of another configuration.
     """
     plan = make_plan(
         config.plan,
@@ -65,19 +72,23 @@ def plan_dataset(config: DatasetConfig, out: Path, *, commit: str) -> Plan:
         image_size=config.sampling.cameras.image_size,
         samples=config.sampling.render.samples,
     )
-    if (out / "dataset.json").exists():
-        _require_same_config(read_dataset_info(str(out)), config, out)
-        if (out / PLAN_FILE).exists() and same_plan(read_plan(out / PLAN_FILE), plan):
-            return plan
-    write_plan(plan, out / PLAN_FILE)
-    info = DatasetInfo(
+    record = DatasetRecord(
+        schema_version=SCHEMA_VERSION,
         name=config.name,
-        config=config_as_json(config),
-        config_hash=config_hash(config),
-        generator_commit=commit,
+        conventions=CONVENTIONS,
+        provenance=provenance_of(config),
+        config_yaml=config_as_yaml(config),
         split_rule=config.split,
     )
-    write_dataset_info(str(out), info)
+    begin_dataset(out, record)
+    path = out / PLAN_FILE
+    if not path.exists():
+        write_plan(plan, path)
+    elif not same_plan(read_plan(path), plan):
+        raise PipelineError(
+            f"{path}: differs from the plan of this configuration (the object library has changed?); "
+            "choose another --out, or delete this one to start over"
+        )
     return plan
 
 
@@ -89,20 +100,19 @@ def render_shard(
     shard: int,
     options: RenderOptions,
     report: Callable[[Progress], None],
-) -> ShardSummary:
+) -> ShardRecord:
     """Render what is missing of one shard and commit it. Safe to repeat, kill and repeat."""
     motions = plan.shard(shard)
+    indices = [motion.motion_index for motion in motions]
+    provenance = provenance_of(config)
     with _lock(out / "staging" / f"shard-{shard:05d}.lock"):
-        if is_shard_committed(out, shard):
-            return commit_shard(out, shard, [m.motion_id for m in motions])
-        waiting = []
-        for motion in motions:
-            if is_motion_staged(out, shard, motion.motion_id):
-                report(Progress(motion_id=motion.motion_id, phase="staged", done=1, total=1))
-            else:
-                waiting.append(motion.motion_index)
-        _run_workers(config_path, out, waiting, shard, options, report)
-        return commit_shard(out, shard, [m.motion_id for m in motions])
+        if not is_shard_committed(out, shard):
+            staged = [index for index in indices if is_motion_staged(out, shard, index, provenance)]
+            for index in staged:
+                report(Progress(motion_index=index, phase="staged", done=1, total=1))
+            waiting = [index for index in indices if index not in staged]
+            _run_workers(config_path, out, waiting, shard, options, report)
+        return commit_shard(out, shard, motion_indices=indices, provenance=provenance)
 
 
 def _run_workers(
@@ -117,15 +127,13 @@ def _run_workers(
     report_lock = threading.Lock()
 
     def render(motion_index: int) -> ChildError | None:
-        motion_id = f"motion-{motion_index:06d}"
-
-        def on_event(event: dict) -> None:
+        def on_event(event: dict[str, Any]) -> None:
             with report_lock:
-                report(Progress(motion_id=motion_id, **event))
+                report(Progress(motion_index=motion_index, **event))
 
         command = [sys.executable, "-m", "datagen.worker", "--config", str(config_path), "--out", str(out)]
         command += ["--motion", str(motion_index), "--device", options.device, "--threads", str(threads)]
-        log = out / "staging" / f"shard-{shard:05d}" / f"{motion_id}.log"
+        log = out / "staging" / f"shard-{shard:05d}" / f"motion-{motion_index:06d}.log"
         try:
             # BLAS threads would only fight with Cycles, and one thread sums in one order everywhere.
             run_child(command, log=log, on_event=on_event, env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
@@ -139,15 +147,6 @@ def _run_workers(
         raise PipelineError(
             f"shard {shard}: {len(errors)} of {len(motion_indices)} motions failed; the others are staged and kept. "
             f"First failure:\n{errors[0]}"
-        )
-
-
-def _require_same_config(info: DatasetInfo, config: DatasetConfig, out: Path) -> None:
-    if info.config_hash != config_hash(config):
-        difference = first_difference(info.config, config_as_json(config))
-        raise PipelineError(
-            f"{out}: holds a dataset of another configuration ({difference}); "
-            "choose another --out, or delete this one to start over"
         )
 
 

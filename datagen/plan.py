@@ -17,8 +17,9 @@ import pyarrow.parquet as pq
 
 from shards.splits import SplitRule, split_of_object
 
-__all__ = ["MotionPlan", "Plan", "PlanConfig", "PlanError", "make_plan", "read_plan", "write_plan"]
+__all__ = ["PLAN_FILE", "MotionPlan", "Plan", "PlanConfig", "PlanError", "make_plan", "read_plan", "write_plan"]
 
+PLAN_FILE = "plan.parquet"
 PLAN_STREAM = 0x504C414E  # the plan's own stream of the dataset seed
 
 

@@ -95,7 +95,7 @@ class TriangleCaster:
         triangle: Int[np.ndarray, "hit"],
         rays_cam: Float[np.ndarray, "hit 3"],
     ) -> Float[np.ndarray, "hit 3"]:
-        """Geometric unit normals in the camera frame, turned against the ray; 0 for a triangle without area."""
+        """Geometric unit normals in the camera frame, turned against the ray; 0 without area."""
         normal = self.normals[triangle] @ T_mesh_from_cam[:3, :3]
         length = np.sqrt(np.einsum("hi,hi->h", normal, normal))
         away = np.einsum("hi,hi->h", normal, rays_cam) > 0.0

@@ -32,7 +32,7 @@ class RenderProgress:
     """A live bar on a terminal; one line per finished motion everywhere."""
 
     def __init__(self, motions: Sequence[MotionPlan]) -> None:
-        self._motions = {motion.motion_id: motion for motion in motions}
+        self._motions = {motion.motion_index: motion for motion in motions}
         self._rendered = dict.fromkeys(self._motions, 0)
         console = Console(stderr=True)
         self._bar = Progress(
@@ -45,7 +45,7 @@ class RenderProgress:
             disable=not console.is_terminal,
             speed_estimate_period=120.0,
         )
-        total = sum(self._n_frames(motion_id) for motion_id in self._motions)
+        total = sum(self._n_frames(index) for index in self._motions)
         self._task = self._bar.add_task("starting", total=total)
 
     def __enter__(self) -> "RenderProgress":
@@ -59,21 +59,21 @@ class RenderProgress:
 
     def update(self, step: Step) -> None:
         """Take one step of one motion."""
-        motion = self._motions[step.motion_id]
+        motion = self._motions[step.motion_index]
         if step.phase in ("staged", "done", "skipped"):
-            self._advance_to(step.motion_id, self._n_frames(step.motion_id))
+            self._advance_to(step.motion_index, self._n_frames(step.motion_index))
             text = {"staged": "was finished before", "done": "done", "skipped": "skipped, reason in shard.json"}
-            self._bar.console.print(f"{step.motion_id} ({motion.object_uid}): {text[step.phase]}")
+            self._bar.console.print(f"motion {step.motion_index} ({motion.object_uid}): {text[step.phase]}")
             return
         if step.phase == "render":
-            self._advance_to(step.motion_id, step.done)
+            self._advance_to(step.motion_index, step.done)
         what = PHASE_TEXT.get(step.phase, step.phase)
-        self._bar.update(self._task, description=f"{what} {step.motion_id} ({motion.object_uid})")
+        self._bar.update(self._task, description=f"{what} motion {step.motion_index} ({motion.object_uid})")
 
-    def _n_frames(self, motion_id: str) -> int:
-        motion = self._motions[motion_id]
+    def _n_frames(self, motion_index: int) -> int:
+        motion = self._motions[motion_index]
         return motion.n_cameras * motion.n_frames
 
-    def _advance_to(self, motion_id: str, done: int) -> None:
-        self._bar.advance(self._task, done - self._rendered[motion_id])
-        self._rendered[motion_id] = done
+    def _advance_to(self, motion_index: int, done: int) -> None:
+        self._bar.advance(self._task, done - self._rendered[motion_index])
+        self._rendered[motion_index] = done

@@ -7,30 +7,33 @@ count change nothing but the time (and the last bits of a colour).
 import argparse
 import shutil
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from datagen.annotate import MotionAnnotator
+from datagen.annotate import MotionGeometry, annotate_frame, hand_object_distances
 from datagen.child import die_with_parent, emit, run_child
-from datagen.config import DatasetConfig, load_config
+from datagen.config import DatasetConfig, config_sha256, load_config
 from datagen.grasps.synthesise import synthesise_grasp
 from datagen.hands.model import load_open_hand, shape_hand
+from datagen.hands.skin import load_open_skin_basis
 from datagen.library import open_library
 from datagen.objects.asset import ObjectAsset
 from datagen.objects.fields import learning_targets
-from datagen.pack import RenderRecord, clip_row, frame_row, object_row
-from datagen.plan import MotionPlan, read_plan
+from datagen.pack import RenderRecord, clip_row, encoded_rgb, frame_row, object_row
+from datagen.plan import PLAN_FILE, MotionPlan, read_plan
+from datagen.sampling.appearance import sample_betas
+from datagen.sampling.errors import SamplingError
 from datagen.sampling.motion import SampledMotion, sample_scene
 from datagen.sampling.streams import Stream, stream_rng
 from datagen.scene_file import save_scene
 from datagen.timing import PhaseTimer
-from shards.images import encode_rgb_file
+from datagen.version import generator_commit
+from shards.records import Provenance
 from shards.schema import ClipRow, FrameRow
-from shards.writer import StagedClip, skip_motion, stage_motion
+from shards.writer import motion_dir, stage_motion, stage_skipped_motion
 
 __all__ = ["main"]
 
@@ -49,7 +52,16 @@ class Job:
 
     @property
     def work_dir(self) -> Path:
-        return self.out / "staging" / f"shard-{self.motion.shard:05d}" / f"{self.motion.motion_id}.work"
+        """Where pictures wait for their labels; what is there after a kill is used again."""
+        return motion_dir(self.out, self.motion.shard, self.motion.motion_index).with_suffix(".work")
+
+    @property
+    def provenance(self) -> Provenance:
+        return Provenance(generator_commit=generator_commit(), config_sha256=config_sha256(self.config))
+
+
+class NoGraspError(ValueError):
+    """No attempt at this motion was worth keeping; the message counts the reasons."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -64,7 +76,7 @@ def main(arguments: list[str] | None = None) -> None:
     die_with_parent()
     job = Job(
         config=load_config(options.config),
-        motion=read_plan(options.out / "plan.parquet").motions[options.motion],
+        motion=read_plan(options.out / PLAN_FILE).motions[options.motion],
         out=options.out,
         device=options.device,
         threads=options.threads,
@@ -81,13 +93,11 @@ def run_job(job: Job) -> None:
         asset = open_library(job.config.objects).load(job.motion.object_uid)
     try:
         sampled = _sampled_motion(job, asset, timer)
-    except (GraspNotFoundError, SamplingError) as error:
-        stage_skipped_motion(
-            job.out, shard, index, reason=str(error), timings_s=timer.seconds, provenance=job.provenance
-        )
+    except (NoGraspError, SamplingError) as error:
+        provenance, seconds = job.provenance, timer.seconds
+        stage_skipped_motion(job.out, shard, index, reason=str(error), timings_s=seconds, provenance=provenance)
         emit(phase="skipped", done=1, total=1)
         return
-    job.work_dir.mkdir(parents=True, exist_ok=True)
     record = _rendered(job, sampled, timer)
     with timer.phase("targets"):
         targets = learning_targets(asset, job.config.seed, job.config.targets)
@@ -112,12 +122,16 @@ def _sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledM
     with timer.phase("grasp"):
         betas = sample_betas(stream_rng(seed, index, Stream.HAND_SHAPE), job.config.sampling.appearance)
         shaped = shape_hand(load_open_hand(), betas)
-        sequence = synthesise_grasp(shaped, asset, job.config.grasp, stream_rng(seed, index, Stream.GRASP))
+        found = synthesise_grasp(shaped, asset, job.config.grasp, stream_rng(seed, index, Stream.GRASP))
+    if found.sequence is None:
+        reasons = ", ".join(f"{reason} {count}" for reason, count in found.failure_counts().items())
+        raise NoGraspError(f"no grasp kept for {asset.uid} in {found.attempts} attempts ({reasons})")
     emit(phase="scene", done=0, total=1)
     with timer.phase("scene"):
         return sample_scene(
-            sequence,
+            found.sequence,
             shaped,
+            load_open_skin_basis(),
             asset,
             job.config.sampling,
             dataset_seed=seed,
@@ -128,6 +142,7 @@ def _sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledM
 
 def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderRecord:
     """Let Blender render what is missing of this motion's pictures."""
+    job.work_dir.mkdir(parents=True, exist_ok=True)
     scene_path = job.work_dir / "scene.npz"
     save_scene(sampled.scene, scene_path)
     n_frames, n_cameras = len(sampled.scene.T_world_from_obj), len(sampled.scene.cameras)
@@ -172,7 +187,7 @@ def _rows(
         with timer.phase("pack"):
             for camera, buffers in enumerate(annotated):
                 png = job.work_dir / f"cam-{camera:02d}" / f"frame-{frame:04d}.png"
-                rgb = encode_rgb(png.read_bytes(), job.config.shard)
+                rgb = encoded_rgb(png.read_bytes(), job.config.shard)
                 rows[camera].append(
                     frame_row(job.motion, sampled, camera, frame, buffers, distances_m[frame], rgb, job.config.shard)
                 )

@@ -114,7 +114,7 @@ def rows_from_table(table: pa.Table, row_type: type[Row]) -> list[Row]:
     return [row_type(**{name: values[i] for name, values in columns.items()}) for i in range(table.num_rows)]
 
 
-def column_values(chunked: pa.ChunkedArray, c: Column) -> Sequence[Any]:
+def column_values(chunked: pa.ChunkedArray, c: Column) -> list[Any] | np.ndarray:
     """Python values of a scalar column; one array (row, *shape), or a list of arrays when lengths vary."""
     if not c.shape:
         return chunked.to_pylist()

@@ -16,6 +16,7 @@ from shards.errors import ImageError
 from shards.png import decode_png, encode_png
 
 __all__ = [
+    "MASK_BITS",
     "DepthCompression",
     "Geometry",
     "Masks",
@@ -44,7 +45,7 @@ class Masks:
     arm_amodal: Bool[np.ndarray, "height width"]
 
 
-_BITS = {
+MASK_BITS = {
     "hand_visible": 1,
     "object_visible": 2,
     "hand_amodal": 4,
@@ -52,6 +53,7 @@ _BITS = {
     "arm_visible": 16,
     "arm_amodal": 32,
 }
+_ALL_BITS = sum(MASK_BITS.values())
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -80,20 +82,21 @@ def decode_rgb(data: bytes) -> UInt8[np.ndarray, "height width 3"]:
     return pixels
 
 
-def encode_masks(masks: Masks) -> bytes:
-    """8-bit gray PNG; the bits are those of the `masks` column."""
-    bits = sum(np.uint8(bit) * getattr(masks, name).astype(np.uint8) for name, bit in _BITS.items())
-    return encode_png(np.asarray(bits, np.uint8), level=9)
+def encode_masks(bits: UInt8[np.ndarray, "height width"]) -> bytes:
+    """8-bit gray PNG of MASK_BITS, one byte per pixel."""
+    if bits.ndim != 2 or bits.max() > _ALL_BITS:
+        raise ImageError("not a mask image", expected=f"(height, width), 0..{_ALL_BITS}", found=bits.shape)
+    return encode_png(bits, level=9)
 
 
 def decode_masks(data: bytes) -> Masks:
     """The six masks. Raises ImageError."""
     bits = decode_png(data)
-    if bits.ndim != 2 or bits.max() >= 64:
+    if bits.ndim != 2 or bits.max() > _ALL_BITS:
         raise ImageError(
-            "not a mask image", expected="gray, 0..63", found=f"{bits.shape}, up to {bits.max()}"
+            "not a mask image", expected=f"gray, 0..{_ALL_BITS}", found=f"{bits.shape}, {bits.max()}"
         )
-    return Masks(**{name: (bits & bit) != 0 for name, bit in _BITS.items()})
+    return Masks(**{name: (bits & bit) != 0 for name, bit in MASK_BITS.items()})
 
 
 def mask_box_px(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, int]:
@@ -104,14 +107,24 @@ def mask_box_px(mask: Bool[np.ndarray, "height width"]) -> tuple[int, int, int, 
     return (int(x[0]), int(y[0]), int(x[-1]) + 1, int(y[-1]) + 1)
 
 
-def encode_geometry(geometry: Geometry, *, compression: DepthCompression = "pxr24") -> bytes:
-    """OpenEXR bytes. Depths are float32: "pxr24" keeps 24 bits of each (relative error < 2^-15),
-    "zip" all of them. Normals are half floats either way."""
-    normals = np.asarray(geometry.normals_cam, np.float16)
+def encode_geometry(
+    depth: Float[np.ndarray, "height width"],
+    depth_object: Float[np.ndarray, "height width"],
+    normals_cam: Float[np.ndarray, "height width 3"],
+    *,
+    compression: DepthCompression,
+) -> bytes:
+    """OpenEXR bytes of what `Geometry` describes.
+
+    Depths are float32: "pxr24" keeps 24 bits of each (relative error at most 2^-16), "zip" all of them.
+    Normals are half floats either way.
+    """
     channels = {
-        "Z": np.ascontiguousarray(geometry.depth, np.float32),
-        "object.Z": np.ascontiguousarray(geometry.depth_object, np.float32),
-        **{f"N.{axis}": np.ascontiguousarray(normals[..., i]) for i, axis in enumerate("XYZ")},
+        "Z": np.ascontiguousarray(depth, np.float32),
+        "object.Z": np.ascontiguousarray(depth_object, np.float32),
+        **{
+            f"N.{axis}": np.ascontiguousarray(normals_cam[..., i], np.float16) for i, axis in enumerate("XYZ")
+        },
     }
     header = {"compression": _COMPRESSION[compression], "type": OpenEXR.scanlineimage}
     stream = io.BytesIO()

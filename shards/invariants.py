@@ -15,7 +15,7 @@ from shards.splits import SplitRule, split_of_object
 __all__ = ["clip_problems", "frame_problems", "object_problems"]
 
 REPROJECTION_PX = 0.01
-RIGID_TOLERANCE = 1e-6
+RIGID_TOLERANCE = 1e-5
 DEPTH_TOLERANCE = 2.0**-14  # relative; twice the error of PXR24
 NORMAL_TOLERANCE = 5e-3  # half floats
 FRACTION_TOLERANCE = 1e-5

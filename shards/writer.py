@@ -10,6 +10,7 @@ shards/shard-00000/                   renamed into place; exists for readers onc
 import itertools
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import pyarrow as pa
@@ -104,8 +105,7 @@ def stage_motion(
     the schema, DiskFullError or StorageError; nothing of the motion is then left behind.
     """
     folder = motion_dir(dataset_dir, shard, motion_index)
-    try:
-        _clear_dir(folder)
+    with _whole_or_nothing(folder, doing=f"storing motion {motion_index}"):
         _write_fragment(folder / "objects.parquet", ObjectRow, [[object_row]])
         _write_fragment(folder / "clips.parquet", ClipRow, [_checked_clips(clips, object_row, motion_index)])
         _write_fragment(folder / "frames.parquet", FrameRow, _frames_by_clip(clips, frames))
@@ -118,14 +118,8 @@ def stage_motion(
             timings_s=dict(timings_s),
             files={f"{name}.parquet": file_record(folder / f"{name}.parquet") for name in ROW_TYPES},
         )
-        write_record(folder / "motion.json", record)
-        return record
-    except OSError as error:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise storage_error(error, folder, doing=f"storing motion {motion_index}") from error
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+        _finish_motion(folder, record)
+    return record
 
 
 def stage_skipped_motion(
@@ -139,7 +133,6 @@ def stage_skipped_motion(
 ) -> MotionRecord:
     """Record that a planned motion cannot be made, and why; it is listed in shard.json."""
     folder = motion_dir(dataset_dir, shard, motion_index)
-    _clear_dir(folder)
     record = MotionRecord(
         motion_index=motion_index,
         schema_version=SCHEMA_VERSION,
@@ -149,7 +142,8 @@ def stage_skipped_motion(
         timings_s=dict(timings_s),
         files={},
     )
-    write_record(folder / "motion.json", record)
+    with _whole_or_nothing(folder, doing=f"recording skipped motion {motion_index}"):
+        _finish_motion(folder, record)
     return record
 
 
@@ -172,8 +166,7 @@ def commit_shard(
     motions = _staged_motions(dataset_dir, shard, motion_indices, provenance)
     partial = final.with_name(f".{final.name}.partial")
     needed = sum(file.n_bytes for motion in motions for file in motion.files.values())
-    try:
-        _clear_dir(partial)
+    with _whole_or_nothing(partial, doing=f"committing shard {shard}", needed_bytes=needed):
         _assemble(staging, motions, partial, provenance)
         files = {f"{name}.parquet": file_record(partial / f"{name}.parquet") for name in ROW_TYPES}
         record = ShardRecord(
@@ -184,13 +177,8 @@ def commit_shard(
             shutil.rmtree(final)
         partial.rename(final)
         fsync_dir(final.parent)
+        fsync_dir(dataset_dir)
         write_record(final / "shard.json", record)
-    except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise storage_error(error, final, doing=f"committing shard {shard}", needed_bytes=needed) from error
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
     shutil.rmtree(staging, ignore_errors=True)
     return record
 
@@ -345,11 +333,33 @@ def _check_same_config(present: Provenance, wanted: Provenance, *, where: Path, 
         )
 
 
-def _clear_dir(folder: Path) -> None:
-    """An empty directory in place of whatever an interrupted run left."""
+@contextmanager
+def _whole_or_nothing(folder: Path, *, doing: str, needed_bytes: int | None = None) -> Iterator[None]:
+    """Fill an empty `folder`; whatever goes wrong, nothing is left in it, and OSErrors become ours."""
+    try:
+        _remove_dir(folder)
+        _make_dir(folder)
+        yield
+    except OSError as error:
+        _remove_dir(folder)
+        raise storage_error(error, folder, doing=doing, needed_bytes=needed_bytes) from error
+    except BaseException:
+        _remove_dir(folder)
+        raise
+
+
+def _finish_motion(folder: Path, record: MotionRecord) -> None:
+    """Write motion.json, and make the whole path to it durable."""
+    write_record(folder / "motion.json", record)
+    for parent in folder.parents[:3]:  # staging/shard-00000, staging, the dataset
+        fsync_dir(parent)
+
+
+def _remove_dir(folder: Path) -> None:
+    """Remove a folder; motion.json goes first, so that half a motion never looks like a whole one."""
     if folder.exists():
+        (folder / "motion.json").unlink(missing_ok=True)
         shutil.rmtree(folder)
-    _make_dir(folder)
 
 
 def _make_dir(folder: Path) -> None:

@@ -16,7 +16,18 @@ from scipy.spatial.transform import Rotation
 
 from datagen.hands.model import ShapedHand
 
-__all__ = ["DIGITS", "DIGIT_BONES", "BoneHull", "HandBody", "Hinge", "Pad", "build_hand_body", "local_rotations"]
+__all__ = [
+    "DIGITS",
+    "DIGIT_BONES",
+    "BoneHull",
+    "Digit",
+    "HandBody",
+    "Hinge",
+    "Pad",
+    "bone_transforms",
+    "build_hand_body",
+    "local_rotations",
+]
 
 Digit = Literal["thumb", "index", "middle", "ring", "pinky"]
 DIGITS: tuple[Digit, ...] = ("thumb", "index", "middle", "ring", "pinky")
@@ -146,9 +157,7 @@ def _thumb_flexion_axis(
     return unit(axis if towards @ (radial - 0.3 * distal) < 0 else -axis)
 
 
-def _finger_hinges(
-    digit: Digit, axis: Float[np.ndarray, "3"], dorsal: Float[np.ndarray, "3"]
-) -> list[Hinge]:
+def _finger_hinges(digit: Digit, axis: Float[np.ndarray, "3"], dorsal: Float[np.ndarray, "3"]) -> list[Hinge]:
     """Ranges of a relaxed adult hand (active range of motion, without hyper-extension)."""
     strength = STRENGTH[digit]
     spread = np.deg2rad(10.0 if digit in ("middle", "ring") else 15.0)
@@ -228,9 +237,7 @@ def _pad(
     near = (weights[:, bone] > 0.6) & (facing > 0.75) & (np.abs(reach - 0.6) < 0.3)
     if not near.any():
         near = (weights[:, bone] > 0.6) & (facing > 0.4)
-    return Pad(
-        digit=digit, bone=bone, position_bone=verts[near].mean(0) - joints[bone], normal_bone=palmar
-    )
+    return Pad(digit=digit, bone=bone, position_bone=verts[near].mean(0) - joints[bone], normal_bone=palmar)
 
 
 def _hulls(

@@ -48,5 +48,3 @@ def _coverage(R_world_from_obj: Float[np.ndarray, "instant 3 3"]) -> float:
     to_camera_obj = np.einsum("tji,cj->cti", R_world_from_obj, to_camera)
     seen = np.einsum("cti,ni->ctn", to_camera_obj, normals_obj) > FACING
     return float(seen.any(1).mean())
-
-

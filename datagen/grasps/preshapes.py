@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from datagen.grasps.hand_body import DIGITS, HandBody, bone_transforms
+from datagen.grasps.hand_body import DIGITS, Digit, HandBody, bone_transforms
 
 __all__ = ["PreshapeLibrary", "build_preshapes", "closing_rates"]
 
@@ -13,7 +13,7 @@ SAMPLES = 20000
 KEPT_PER_APERTURE = 30
 APERTURE_STEP_M = 0.01
 # How much each finger's pad counts in the opposition to the thumb.
-FINGER_SHARE = {"index": 0.35, "middle": 0.4, "ring": 0.25, "pinky": 0.0}
+FINGER_SHARE: dict[Digit, float] = {"index": 0.35, "middle": 0.4, "ring": 0.25, "pinky": 0.0}
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,8 +20,8 @@ SURFACE_POINTS = 2500
 MAX_THICKNESS_M = 0.105
 MAX_LEVER_M = 0.08  # from the grip axis to the centre of mass
 APPROACH_M = 0.10
-ADVANCE_M = 0.008
-OVERLAP_M = 0.0015  # tolerated while testing placements
+ADVANCE_M = 0.005
+OVERLAP_M = 0.0003  # tolerated on the way in
 CLOSE_STEP_RAD = 0.06
 CLOSE_STEPS = 26
 FOLLOW_RAD = np.deg2rad(18.0)  # a free finger closes this much further than the gripping ones
@@ -49,12 +49,13 @@ class Proposal:
 def sample_surface(obj: ObjectAsset, rng: np.random.Generator) -> SurfaceSamples:
     """Area-weighted samples; points inside another part are left out."""
     parts = [trimesh.convex.convex_hull(part.verts_obj) for part in obj.solid.parts]
-    surface = trimesh.util.concatenate(parts)
-    share = surface.area_faces / surface.area_faces.sum()
-    face = rng.choice(len(share), SURFACE_POINTS, p=share)
+    triangles = np.concatenate([part.triangles for part in parts])
+    face_normals = np.concatenate([part.face_normals for part in parts])
+    area = np.concatenate([part.area_faces for part in parts])
+    face = rng.choice(len(area), SURFACE_POINTS, p=area / area.sum())
     bary = rng.dirichlet([1.0, 1.0, 1.0], SURFACE_POINTS)
-    points = np.einsum("pk,pki->pi", bary, surface.triangles[face])
-    normals = surface.face_normals[face]
+    points = np.einsum("pk,pki->pi", bary, triangles[face])
+    normals = face_normals[face]
     outside = np.ones(len(points), bool)
     for part in parts:
         offset = (part.face_normals * part.triangles[:, 0]).sum(1)
@@ -185,13 +186,10 @@ def _slide_in(
     world.reset(wrist, angles, start.T_world_from_obj, start.table_edge)
 
     def free(depth_m: float) -> bool:
-        moved = WristTarget(
-            R_world_from_hand=wrist.R_world_from_hand, position_world=wrist.position_world + depth_m * approach
-        )
-        world.place_hand(moved, angles)
+        world.place_hand(wrist.moved(depth_m * approach), angles)
         world.detect()
         in_object, in_table = world.overlap()
-        return in_object < OVERLAP_M + config.contact_distance_m and in_table < 0.0005
+        return in_object < OVERLAP_M and in_table < 0.0005
 
     if not free(0.0) and not free(-0.008):
         return None
@@ -204,9 +202,7 @@ def _slide_in(
         deepest = float(depth)
     # Leave the skin a little air: the fingers close from here.
     deepest -= 0.002
-    return WristTarget(
-        R_world_from_hand=wrist.R_world_from_hand, position_world=wrist.position_world + deepest * approach
-    )
+    return wrist.moved(deepest * approach)
 
 
 def closing_step(
@@ -278,7 +274,7 @@ def _judge(world: GraspWorld, contacts: HandContacts, com: Float[np.ndarray, "3"
     axis = off_axis / (np.linalg.norm(off_axis) + 1e-9)
     lever = float(np.linalg.norm(center - com))
     facing = []
-    for k, pad in enumerate(world.body.pads):
+    for pad in world.body.pads:
         rows = contacts.bone == pad.bone
         if rows.any():
             R = world.data.xmat[world.bone_body[pad.bone]].reshape(3, 3)
@@ -290,6 +286,7 @@ def _judge(world: GraspWorld, contacts: HandContacts, com: Float[np.ndarray, "3"
         + 0.35 * len(digits)
         + (0.6 if 0 in digits else 0.0)
         + 0.8 * pad_contact
+        + 0.08 * len(set(contacts.bone.tolist()))
         - 12.0 * lever
     )
 

@@ -1,20 +1,35 @@
 """Figures of a simulated motion, measured on the skinned hand and the object's own mesh."""
 
+from dataclasses import dataclass
+
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial.transform import Rotation
 
 from datagen.grasps.config import GraspConfig
-from datagen.grasps.hand_body import HandBody
-from datagen.grasps.sequence import GraspQuality, GraspSequence
+from datagen.grasps.hand_body import HandBody, local_rotations
+from datagen.grasps.movement import Movement
+from datagen.grasps.sequence import GraspQuality, TableEdge
 from datagen.grasps.simulation import Failure, MotionTrace
-from datagen.hands.model import PosedHand, ShapedHand, pose_hand
+from datagen.hands.model import PosedHand
 from datagen.objects.asset import ObjectAsset
 
-__all__ = ["ObjectSurface", "hand_center", "measured_instants", "penetration_depths", "rejection"]
+__all__ = [
+    "HandParameters",
+    "ObjectSurface",
+    "below_table",
+    "hand_center",
+    "hand_parameters",
+    "measure_quality",
+    "measured_instants",
+    "penetration_depths",
+    "rejection",
+]
 
 INSTANTS = 24  # of the carried motion; the approach gets a few more
 CONTACT_N = 0.05
+SUNK_M = 0.002
 FINGER_MIDDLE_JOINTS = [2, 5, 8, 11]  # PIP
 THUMB_TIP = 16  # row of PosedHand.joints_world
 
@@ -50,14 +65,22 @@ def measured_instants(grasp_frame: int, frames: int) -> Int[np.ndarray, "instant
     return np.unique(np.concatenate([before, carried]).round().astype(int))
 
 
-def pose_at(hand: ShapedHand, sequence: GraspSequence, rows: Int[np.ndarray, "instant"]) -> PosedHand:
-    """The skinned hand at some frames of a sequence."""
-    return pose_hand(
-        hand,
-        orientation_world=sequence.hand_orientation_world[rows],
-        hand_pose=sequence.hand_pose[rows],
-        translation_world=sequence.hand_translation_world[rows],
-        flat_hand_mean=sequence.flat_hand_mean,
+@dataclass(frozen=True, kw_only=True)
+class HandParameters:
+    """A simulated motion in the terms of `pose_hand` (flat_hand_mean)."""
+
+    orientation_world: Float[np.ndarray, "frame 3"]
+    hand_pose: Float[np.ndarray, "frame 45"]
+    translation_world: Float[np.ndarray, "frame 3"]
+
+
+def hand_parameters(body: HandBody, trace: MotionTrace) -> HandParameters:
+    """Hinge angles and wrist poses as MANO axis-angles and translation; exact."""
+    local = local_rotations(body, trace.angles_rad)[:, 1:]
+    return HandParameters(
+        orientation_world=Rotation.from_matrix(trace.R_world_from_hand).as_rotvec(),
+        hand_pose=Rotation.from_matrix(local.reshape(-1, 3, 3)).as_rotvec().reshape(len(local), 45),
+        translation_world=trace.wrist_position_world - body.joints_rest[0],
     )
 
 
@@ -79,22 +102,21 @@ def hand_center(posed: PosedHand) -> Float[np.ndarray, "instant 3"]:
 
 
 def measure_quality(
-    hand: ShapedHand,
+    posed: PosedHand,
     surface: ObjectSurface,
-    sequence: GraspSequence,
     trace: MotionTrace,
+    rows: Int[np.ndarray, "instant"],
     com_obj: Float[np.ndarray, "3"],
-) -> tuple[GraspQuality, PosedHand]:
-    """Quality of a motion (attempts still 0) and the posed hand at the measured instants."""
-    rows = measured_instants(trace.grasp_frame, len(trace.angles_rad))
-    posed = pose_at(hand, sequence, rows)
+    attempts: int,
+) -> GraspQuality:
+    """Quality of a motion whose skinned hand is given at the frames `rows` (the last one included)."""
     depth = penetration_depths(surface, posed.verts_world, trace.T_world_from_obj[rows])
     com_world = trace.T_world_from_obj[:, :3, :3] @ com_obj + trace.T_world_from_obj[:, :3, 3]
     com_hand = np.einsum("tji,tj->ti", trace.R_world_from_hand, com_world - trace.wrist_position_world)
     lifting = com_hand[trace.grasp_frame : trace.lifted_frame] - com_hand[trace.grasp_frame]
     turning = com_hand[trace.lifted_frame :] - com_hand[trace.lifted_frame]
     end = trace.T_world_from_obj[-1, :3, 3]
-    quality = GraspQuality(
+    return GraspQuality(
         rise_m=float(end[2] - trace.T_world_from_obj[0, 2, 3]),
         center_distance_m=float(np.linalg.norm(hand_center(posed)[-1] - end)),
         max_penetration_m=float(depth.max()),
@@ -102,30 +124,29 @@ def measure_quality(
         slip_lift_m=float(np.linalg.norm(lifting, axis=1).max()),
         slip_manipulation_m=float(np.linalg.norm(turning, axis=1).max()),
         contact_force_n=float(trace.force_n[-1].sum()),
-        attempts=0,
+        attempts=attempts,
     )
-    return quality, posed
 
 
 def rejection(
-    quality: GraspQuality, sequence: GraspSequence, rotation_range_rad: float, config: GraspConfig
+    quality: GraspQuality, trace: MotionTrace, movement: Movement, config: GraspConfig
 ) -> Failure | None:
-    """The first rule a motion breaks, or None: GraspXL's two, then contact, depth and slip."""
+    """The first rule a motion breaks, or None: GraspXL's two, then contact, depth, slip, movement."""
     rules = (
         (quality.rise_m > config.min_rise_m, Failure.NOT_RISEN),
         (quality.center_distance_m < config.max_center_distance_m, Failure.OFF_CENTER),
         (quality.digits_in_contact >= config.min_digits, Failure.FEW_DIGITS),
-        (sequence.contact_force_n[-1, 0] > CONTACT_N, Failure.FEW_DIGITS),  # the thumb opposes
+        (trace.force_n[-1, 0] > CONTACT_N, Failure.FEW_DIGITS),  # the thumb opposes
         (quality.max_penetration_m <= config.max_penetration_m, Failure.PENETRATION),
         (quality.slip_lift_m <= config.max_slip_m, Failure.SLIP),
         (quality.slip_manipulation_m <= config.max_slip_m, Failure.SLIP),
-        (rotation_range_rad >= config.min_movement_rad, Failure.NO_MOVEMENT),
+        (movement.rotation_range_rad >= config.min_movement_rad, Failure.NO_MOVEMENT),
     )
     return next((failure for passed, failure in rules if not passed), None)
 
 
 def below_table(
-    posed: PosedHand, sequence: GraspSequence, body: HandBody, config: GraspConfig
+    posed: PosedHand, edge: TableEdge | None, body: HandBody, config: GraspConfig
 ) -> Bool[np.ndarray, "instant"]:
     """Instants at which skin or forearm sinks into the table by more than 2 mm."""
     wrist = posed.T_world_from_joint[:, 0]
@@ -134,8 +155,8 @@ def below_table(
     forearm = wrist[:, None, :3, 3] - back[:, None] * axis[:, None]
     forearm = forearm - [0.0, 0.0, config.forearm_radius_m]
     points = np.concatenate([posed.verts_world, forearm], 1)
-    sunk = points[..., 2] < -0.002
-    if sequence.table_edge is not None:
-        beyond = (points[..., :2] - sequence.table_edge.point_xy_m) @ np.array(sequence.table_edge.outward_xy)
-        sunk &= beyond < -0.002
+    sunk = points[..., 2] < -SUNK_M
+    if edge is not None:
+        beyond = (points[..., :2] - edge.point_xy_m) @ np.array(edge.outward_xy)
+        sunk &= beyond < -SUNK_M
     return sunk.any(1)

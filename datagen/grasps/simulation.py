@@ -11,15 +11,16 @@ from datagen.grasps.config import GraspConfig
 from datagen.grasps.preshapes import closing_rates
 from datagen.grasps.proposals import APPROACH_M, Proposal, closing_step
 from datagen.grasps.starts import Start
-from datagen.grasps.wrist_motion import WristPath, plan_turns, straight
 from datagen.grasps.world import PALM, GraspWorld, HandContacts, WristTarget, quaternion_wxyz
+from datagen.grasps.wrist_motion import WristPath, plan_turns, straight
 
 __all__ = ["FRAME_RATE_HZ", "Failure", "MotionTrace", "simulate"]
 
 FRAME_RATE_HZ = 100.0  # GraspXL's
 CLOSE_SPEED_RAD_S = 2.0
 TOUCH_FORCE_N = 0.15
-SQUEEZE_S, SETTLE_S, END_S = 0.15, 0.15, 0.1
+SQUEEZE_S, SETTLE_S, END_S = 0.15, 0.2, 0.1
+TIGHTEN = 0.12  # share of the squeeze added per frame while the grip is too weak
 LOST_M = 0.05  # the object moved this far in the hand: dropped
 
 
@@ -122,10 +123,7 @@ def simulate(
     """Play one proposal; the failure says in which phase it ended."""
     timestep = float(world.model.opt.timestep)
     goal = proposal.wrist
-    first = WristTarget(
-        R_world_from_hand=goal.R_world_from_hand,
-        position_world=goal.position_world - APPROACH_M * proposal.approach_world,
-    )
+    first = goal.moved(-APPROACH_M * proposal.approach_world)
     world.reset(first, proposal.angles_rad, start.T_world_from_obj, start.table_edge)
     recorder = _Recorder(world)
     way = APPROACH_M * proposal.approach_world
@@ -136,11 +134,11 @@ def simulate(
     force = contacts.digit_force_n()
     if not (force[1:PALM] > TOUCH_FORCE_N).any() or force[[0, PALM]].max() < TOUCH_FORCE_N:
         return Failure.NO_OPPOSITION
-    _squeeze(world, recorder, contacts, config)
+    squeeze = _squeeze(world, recorder, contacts, config)
     world.release_object()
     grasp_frame = len(recorder.angles)
     held = object_in_hand(world)
-    recorder.rest(SETTLE_S)
+    _tighten(world, recorder, squeeze)
     force = world.contacts().digit_force_n()
     if np.linalg.norm(object_in_hand(world) - held) > 0.5 * LOST_M or (force > 0.05).sum() < 2:
         return Failure.LOST_ON_RELEASE
@@ -148,7 +146,7 @@ def simulate(
     if not recorder.carry(straight(goal, lift, round(config.lift_s / timestep))):
         return Failure.DROPPED_IN_LIFT
     lifted_frame = len(recorder.angles)
-    lifted = WristTarget(R_world_from_hand=goal.R_world_from_hand, position_world=goal.position_world + lift)
+    lifted = goal.moved(lift)
     T = world.T_world_from_obj()
     pivot = T[:3, :3] @ world.com_obj + T[:3, 3]
     carried = _carried_points(world, config)
@@ -178,7 +176,17 @@ def _close(world: GraspWorld, recorder: _Recorder, proposal: Proposal, config: G
             break
 
 
-def _squeeze(world: GraspWorld, recorder: _Recorder, contacts: HandContacts, config: GraspConfig) -> None:
+@dataclass(frozen=True, kw_only=True)
+class _Squeeze:
+    """How the fingers press: their total force and the shift of the joint targets that makes it."""
+
+    force_n: float
+    shift_rad: Float[np.ndarray, "hinge"]
+
+
+def _squeeze(
+    world: GraspWorld, recorder: _Recorder, contacts: HandContacts, config: GraspConfig
+) -> _Squeeze:
     """Hold the present posture stiffly and press with a force that suits the weight.
 
     Torques come from the transposed contact Jacobians, so that thumb and fingers balance.
@@ -198,11 +206,21 @@ def _squeeze(world: GraspWorld, recorder: _Recorder, contacts: HandContacts, con
             mujoco.mj_jac(world.model, world.data, jacobian, None, contacts.position_world[contact], body)
             push = contacts.normal_world[contact] * total * share / len(rows)
             torque += jacobian[:, world.hinge_dof].T @ push
-    torque = np.clip(torque, -world.torque_nm, world.torque_nm)
-    before, after = world.data.ctrl.copy(), world.angles() + torque / world.stiffness_nm
+    shift = np.clip(torque, -world.torque_nm, world.torque_nm) / world.stiffness_nm
+    before, after = world.data.ctrl.copy(), world.angles() + shift
     frames = round(SQUEEZE_S * FRAME_RATE_HZ)
     for k in range(frames):
         world.data.ctrl[:] = before + (after - before) * min(1.0, 1.5 * (k + 1) / frames)
+        recorder.rest(1.0 / FRAME_RATE_HZ)
+    return _Squeeze(force_n=total, shift_rad=shift)
+
+
+def _tighten(world: GraspWorld, recorder: _Recorder, squeeze: _Squeeze) -> None:
+    """Settle after the release; press on while the fingers have lost force."""
+    for _ in range(round(SETTLE_S * FRAME_RATE_HZ)):
+        force = world.contacts().digit_force_n()
+        if force[1:PALM].sum() < squeeze.force_n:
+            world.data.ctrl[:] += TIGHTEN * squeeze.shift_rad
         recorder.rest(1.0 / FRAME_RATE_HZ)
 
 

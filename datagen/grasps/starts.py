@@ -97,8 +97,11 @@ def sample_start(poses: RestingPoses, config: GraspConfig, rng: np.random.Genera
         ]
     )
     if weights.sum() <= 0.0:
-        raise ValueError(f"no kind of start is allowed for a {poses.height_m[pose]:.3f} m high object: raise table_start_weight")
-    kind: StartKind = ("table", "edge", "held")[rng.choice(3, p=weights / weights.sum())]  # type: ignore[assignment]
+        raise ValueError(
+            f"no kind of start is allowed for a {poses.height_m[pose]:.3f} m high object: "
+            "raise table_start_weight"
+        )
+    kind: StartKind = ("table", "edge", "held")[rng.choice(3, p=weights / weights.sum())]
     yaw = Rotation.from_euler("z", rng.uniform(0.0, 2 * np.pi)).as_matrix()
     R = yaw @ poses.R_world_from_obj[pose]
     if kind == "held":

@@ -31,6 +31,12 @@ class WristTarget:
     R_world_from_hand: Float[np.ndarray, "3 3"]
     position_world: Float[np.ndarray, "3"]
 
+    def moved(self, shift_world: Float[np.ndarray, "3"]) -> "WristTarget":
+        """The same orientation elsewhere."""
+        return WristTarget(
+            R_world_from_hand=self.R_world_from_hand, position_world=self.position_world + shift_world
+        )
+
 
 @dataclass(frozen=True, kw_only=True)
 class HandContacts:
@@ -243,7 +249,7 @@ def _add_table(spec: mujoco.MjSpec) -> None:
 
 
 def _add_hand(spec: mujoco.MjSpec, body: HandBody, config: GraspConfig) -> None:
-    nodes = {}
+    nodes: dict[int, mujoco.MjsBody] = {}
     for bone in range(16):
         parent = int(body.parents[bone])
         if bone == 0:

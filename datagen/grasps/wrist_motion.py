@@ -10,12 +10,13 @@ from datagen.grasps.config import GraspConfig
 from datagen.grasps.hand_body import HandBody
 from datagen.grasps.world import WristTarget
 
-__all__ = ["WristPath", "minimum_jerk", "straight", "turn_about", "plan_turns"]
+__all__ = ["WristPath", "minimum_jerk", "plan_turns", "straight", "turn_about"]
 
 # Share of the configured angle that each natural wrist and arm motion gets, about the
 # forearm (pronation), the knuckle line (flexion) and the vertical (the arm swings).
 TURN_SHARE = (1.0, 0.5, 0.8)
-SHIFT_M = 0.04
+SHIFT_M = (0.05, 0.05, 0.03)  # either way
+RAISE_M = 0.12  # more height where the table would be in the way
 TURN_TRIES = 40
 PATH_CHECKS = 5
 
@@ -80,13 +81,14 @@ def plan_turns(
     paths: list[WristPath] = []
     at, pivot, turned = start, pivot_world, Rotation.identity()
     for _ in range(int(rng.integers(config.turns[0], config.turns[1] + 1))):
-        for _ in range(TURN_TRIES):
+        for attempt in range(TURN_TRIES):
             angle = rng.uniform(*config.turn_angle_rad)
             direction = rng.normal(size=3)
             direction /= np.linalg.norm(direction)
             wanted = Rotation.from_rotvec(axes @ (direction * TURN_SHARE * angle))
             step = (wanted * turned.inv()).as_rotvec()
-            shift = pivot_world + rng.uniform(-SHIFT_M, SHIFT_M, 3) - pivot
+            shift = pivot_world + rng.uniform(-1.0, 1.0, 3) * SHIFT_M - pivot
+            shift[2] += attempt / TURN_TRIES * RAISE_M
             if np.linalg.norm(step) < 0.5 * config.turn_angle_rad[0]:
                 continue
             if not _clear(local, turned, step, pivot, shift, config.table_clearance_m):

@@ -85,7 +85,7 @@ def _lightened(
     body = _manifold(solid.verts_obj, solid.faces)
     longest = float(np.ptp(solid.verts_obj, axis=0).max())
     tolerance = 5e-4 * longest
-    while body.num_tri() > max_faces and tolerance < 0.01 * longest:
+    while body.num_tri() > max_faces and tolerance < 2.5e-3 * longest:
         lighter = body.simplify(tolerance)
         if lighter.is_empty() or lighter.volume() < 0.9 * body.volume():
             break

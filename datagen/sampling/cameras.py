@@ -61,7 +61,9 @@ class CamerasConfig:
 
     def __post_init__(self) -> None:
         if self.slack[0] < 1.0:
-            raise ValueError(f"slack starts at {self.slack[0]}: expected >= 1, or vertices would leave the image")
+            raise ValueError(
+                f"slack starts at {self.slack[0]}: expected >= 1, or vertices would leave the image"
+            )
         if not 0.0 <= self.margin < 0.4:
             raise ValueError(f"margin is {self.margin}: expected 0 <= margin < 0.4 of the shorter side")
 

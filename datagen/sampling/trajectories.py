@@ -103,17 +103,18 @@ def view_rotations(path: ViewPath) -> Float[np.ndarray, "frame 3 3"]:
         ],
         axis=-1,
     )
-    return look_at(outward, np.zeros(3), path.roll_rad)[:, :3, :3]
+    return look_at(outward, np.zeros_like(outward), path.roll_rad)[:, :3, :3]
 
 
 def band_limited(
     n_frames: int, fps: float, band_hz: tuple[float, float], rng: np.random.Generator, channels: int
 ) -> Float[np.ndarray, "channel frame"]:
-    """Smooth noise within +-1: a few sines of random frequency and phase. Raises SamplingError on an empty band."""
+    """Smooth noise within +-1: a few sines of random frequency and phase. SamplingError on an empty band."""
     low, high = band_hz[0], min(band_hz[1], fps / 6.0)  # six frames per period at least
     if not 0.0 < low <= high:
         raise SamplingError(
-            f"shake band {band_hz} Hz at {fps} fps: expected 0 < lowest <= fps / 6; lower limits.shake_band_hz"
+            f"shake band {band_hz} Hz at {fps} fps: expected 0 < lowest <= fps / 6; "
+            "lower cameras.limits.shake_band_hz or raise clip.fps"
         )
     shape = (channels, SHAKE_WAVES, 1)
     frequency, phase = rng.uniform(low, high, shape), rng.uniform(0.0, 2.0 * np.pi, shape)

@@ -1,4 +1,4 @@
-"""How much of the object a camera sees, by casting a coarse grid of rays: cheap enough for every candidate."""
+"""How much of the object a camera sees, by a coarse grid of rays: cheap enough for every candidate."""
 
 from dataclasses import dataclass
 
@@ -41,7 +41,10 @@ class VisibilityProbe:
         self._rays_across = rays_across
 
     def look(
-        self, K: Float[np.ndarray, "3 3"], image_size: tuple[int, int], T_cam_from_world: Float[np.ndarray, "frame 4 4"]
+        self,
+        K: Float[np.ndarray, "3 3"],
+        image_size: tuple[int, int],
+        T_cam_from_world: Float[np.ndarray, "frame 4 4"],
     ) -> SeenFigures:
         """Rays through an image of `rays_across` pixels; the size in pixels is scaled back."""
         coarse = self._rays_across / image_size[0]

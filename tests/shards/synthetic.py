@@ -11,13 +11,12 @@ import numpy as np
 
 from shards.geometry import (
     intrinsics_from_fov,
-    invert_transform,
     look_at,
     pixel_rays_cam,
     project_points,
     transform_points,
 )
-from shards.images import Geometry, Masks, encode_geometry, encode_masks, encode_rgb_png, mask_box_px
+from shards.images import MASK_BITS, encode_geometry, encode_masks, encode_rgb_png, mask_box_px
 from shards.records import DatasetRecord, MotionRecord, Provenance
 from shards.schema import CONVENTIONS, SCHEMA_VERSION, ClipRow, FrameRow, ObjectRow
 from shards.splits import SplitRule, split_of_object
@@ -209,11 +208,10 @@ def synthetic_frame(
         masks[f"{name}_amodal"] = depth > 0
         masks[f"{name}_visible"] = (depth > 0) & (depth == first)
         normals[masks[f"{name}_visible"]] = normal[masks[f"{name}_visible"]]
-    geometry = Geometry(
-        depth=np.where(np.isfinite(first), first, 0.0),
-        depth_object=surfaces["object"][0],
-        normals_cam=normals,
+    geometry = encode_geometry(
+        np.where(np.isfinite(first), first, 0.0), surfaces["object"][0], normals, compression="pxr24"
     )
+    bits = np.sum([np.uint8(bit) * masks[name] for name, bit in MASK_BITS.items()], axis=0, dtype=np.uint8)
     rgb = np.clip(127.5 * (normals + 1.0), 0, 255).astype(np.uint8)
     joints_world = hand_center_world + 0.02 * np.random.default_rng(3).normal(size=(21, 3))
     joints_world = joints_world.astype(np.float32)
@@ -243,8 +241,8 @@ def synthetic_frame(
         contact_force_n=np.array([1.0, 0.5, 0.5, 0.0, 0.0]),
         hand_object_distance_m=-0.001,
         rgb=encode_rgb_png(rgb),
-        masks=encode_masks(Masks(**masks)),
-        geometry=encode_geometry(geometry),
+        masks=encode_masks(bits),
+        geometry=geometry,
     )
 
 
@@ -264,7 +262,6 @@ __all__ = [
     "PROVENANCE",
     "SPLIT_RULE",
     "dataset_record",
-    "invert_transform",
     "stage_synthetic",
     "synthetic_clip",
     "synthetic_dataset",

@@ -1,0 +1,141 @@
+"""A shard in the terminal: clips, objects, licences, quality, sizes, timings."""
+
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from rich.console import Group
+from rich.table import Table
+
+from shards.reader import Shard
+from shards.reader import Table as Columns
+from shards.records import ShardRecord
+
+__all__ = ["shard_line", "shard_summary"]
+
+CLIP_COLUMNS = (
+    "clip_id", "motion_index", "camera_kind", "object_uid", "split", "n_frames", "fps", "image_width",
+    "image_height", "object_visible_fraction_mean", "object_visible_fraction_min", "object_drift_px",
+    "min_margin_px", "max_penetration_m", "digits_in_contact", "slip_lift_m", "slip_manipulation_m",
+    "grasp_attempts", "hdri", "table_material", "render_device", "render_samples", "render_seconds",
+)  # fmt: skip
+OBJECT_COLUMNS = ("object_uid", "name", "licence", "author", "object_scale_m", "texture_resolution_px", "color_detail")
+
+
+def shard_line(record: ShardRecord, out: Path) -> str:
+    """One line on a finished shard."""
+    size = sum(file.n_bytes for file in record.files.values()) / 1e6
+    return (
+        f"shard {record.shard} in {out}: {len(record.clip_ids)} clips, {record.files['frames.parquet'].rows} frames, "
+        f"{size:.1f} MB, {len(record.skipped)} motions skipped"
+    )
+
+
+def shard_summary(shard: Shard) -> Group:
+    """Everything a person wants to know before using a shard, as rich tables."""
+    clips = shard.read_clips(CLIP_COLUMNS)
+    objects = shard.read_objects(OBJECT_COLUMNS)
+    parts = [_overview(shard, clips), _objects(objects, clips), _clips(clips), _files(shard), _timings(shard)]
+    if shard.record.skipped:
+        parts.append(_skipped(shard))
+    return Group(*parts)
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, justify="left" if column in ("", "clip", "object", "file", "phase") else "right")
+    return table
+
+
+def _overview(shard: Shard, clips: Columns) -> Table:
+    record = shard.record
+    sizes = sorted({f"{w} x {h}" for w, h in zip(clips["image_width"], clips["image_height"])})
+    splits = Counter(clips["split"])
+    table = _table(f"shard {record.shard}: {shard.path}", "", "value")
+    for name, value in (
+        ("schema version", record.schema_version),
+        ("generator", record.provenance.generator_commit[:16]),
+        ("configuration", record.provenance.config_sha256[:16]),
+        ("motions", f"{len(record.motions) - len(record.skipped)} made, {len(record.skipped)} skipped"),
+        ("clips", f"{len(clips)}"),
+        ("frames", f"{sum(clips['n_frames'])}"),
+        ("images", ", ".join(sizes)),
+        ("splits", ", ".join(f"{split} {count}" for split, count in sorted(splits.items()))),
+        ("rendered on", ", ".join(sorted(set(clips["render_device"])))),
+    ):
+        table.add_row(name, value)
+    return table
+
+
+def _objects(objects: Columns, clips: Columns) -> Table:
+    table = _table("objects", "object", "name", "licence", "author", "longest side", "texture", "detail", "clips")
+    count = Counter(clips["object_uid"])
+    for i, uid in enumerate(objects["object_uid"]):
+        table.add_row(
+            uid,
+            objects["name"][i],
+            objects["licence"][i],
+            objects["author"][i],
+            f"{100 * objects['object_scale_m'][i]:.1f} cm",
+            f"{objects['texture_resolution_px'][i]} px",
+            f"{objects['color_detail'][i]:.2f}",
+            str(count[uid]),
+        )
+    return table
+
+
+def _clips(clips: Columns) -> Table:
+    table = _table(
+        "clips", "clip", "object", "camera", "visible mean/min", "drift", "margin", "grasp: depth", "digits",
+        "slip lift/turn", "tries", "light", "table", "s/frame",
+    )  # fmt: skip
+    for i, clip_id in enumerate(clips["clip_id"]):
+        table.add_row(
+            clip_id,
+            clips["object_uid"][i],
+            clips["camera_kind"][i],
+            f"{clips['object_visible_fraction_mean'][i]:.2f} / {clips['object_visible_fraction_min'][i]:.2f}",
+            f"{clips['object_drift_px'][i]:.0f} px",
+            f"{clips['min_margin_px'][i]:.0f} px",
+            f"{1000 * clips['max_penetration_m'][i]:.1f} mm",
+            f"{clips['digits_in_contact'][i]}",
+            f"{1000 * clips['slip_lift_m'][i]:.0f} / {1000 * clips['slip_manipulation_m'][i]:.0f} mm",
+            f"{clips['grasp_attempts'][i]}",
+            clips["hdri"][i],
+            clips["table_material"][i] or "none",
+            f"{clips['render_seconds'][i] / clips['n_frames'][i]:.2f}",
+        )
+    return table
+
+
+def _files(shard: Shard) -> Table:
+    table = _table("files", "file", "rows", "size", "sha256")
+    for name, file in sorted(shard.record.files.items()):
+        table.add_row(name, str(file.rows), f"{file.n_bytes / 1e6:.2f} MB", file.sha256[:12])
+    total = sum(file.n_bytes for file in shard.record.files.values())
+    table.add_row("all", "", f"{total / 1e6:.2f} MB", "")
+    return table
+
+
+def _timings(shard: Shard) -> Table:
+    seconds: dict[str, list[float]] = defaultdict(list)
+    for motion in shard.record.motions:
+        for phase, value in motion.timings_s.items():
+            seconds[phase].append(value)
+    table = _table("time", "phase", "all motions", "median of a motion")
+    for phase, values in seconds.items():
+        table.add_row(phase, f"{sum(values):.1f} s", f"{_median(values):.2f} s")
+    return table
+
+
+def _skipped(shard: Shard) -> Table:
+    table = _table("skipped motions", "motion", "reason")
+    for motion in shard.record.skipped:
+        table.add_row(str(motion.motion_index), motion.skip_reason)
+    return table
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(np.asarray(values)))

@@ -1,0 +1,61 @@
+"""Hand shape, skin, forearm and sleeve: drawn from plausible ranges."""
+
+import colorsys
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from datagen.hands.arm import ArmStyle
+
+__all__ = ["AppearanceConfig", "sample_arm_style", "sample_betas", "sample_sleeve_color"]
+
+MAX_BETA = 2.0  # in standard deviations: beyond it shapes are caricatures
+
+
+@dataclass(frozen=True, kw_only=True)
+class AppearanceConfig:
+    """Looks of a hand. Pairs are (lowest, highest) of a uniform draw."""
+
+    n_betas: int
+    betas_std: float
+    skin_roughness: tuple[float, float]
+    subsurface: tuple[float, float]
+    bump: tuple[float, float]
+    nail_gloss: tuple[float, float]
+    forearm_length_m: tuple[float, float]  # at most what the grasps were simulated with
+    forearm_girth: tuple[float, float]
+    sleeve_probability: float
+    sleeve_start_m: tuple[float, float]  # from the wrist
+    sleeve_weave: tuple[float, float]
+
+
+def sample_betas(rng: np.random.Generator, config: AppearanceConfig) -> Float[np.ndarray, "beta"]:
+    """Shape coefficients of the hand model: normal, cut off at two standard deviations."""
+    return config.betas_std * np.clip(rng.normal(size=config.n_betas), -MAX_BETA, MAX_BETA)
+
+
+def sample_arm_style(rng: np.random.Generator, config: AppearanceConfig) -> ArmStyle:
+    """Forearm, and perhaps a sleeve, for one motion."""
+    length = rng.uniform(*config.forearm_length_m)
+    has_sleeve = rng.uniform() < config.sleeve_probability
+    start = min(rng.uniform(*config.sleeve_start_m), 0.6 * length)
+    return ArmStyle(
+        length_m=float(length),
+        girth=float(rng.uniform(*config.forearm_girth)),
+        sleeve_start_m=float(start) if has_sleeve else None,
+        sleeve_gap_m=float(rng.uniform(0.003, 0.009)),
+        cuff_m=float(rng.uniform(0.015, 0.06)),
+        fold_depth_m=float(rng.uniform(0.001, 0.004)),
+        fold_phase_rad=float(rng.uniform(0.0, 2.0 * np.pi)),
+    )
+
+
+def sample_sleeve_color(rng: np.random.Generator) -> tuple[float, float, float]:
+    """Linear colour of cloth: half of all clothes are black, white, grey or blue."""
+    if rng.uniform() < 0.5:
+        hue, saturation = rng.normal(0.61, 0.02), rng.choice([0.05, 0.55]) * rng.uniform(0.5, 1.5)
+    else:
+        hue, saturation = rng.uniform(), rng.uniform(0.2, 0.8)
+    value = float(np.exp(rng.uniform(np.log(0.02), np.log(0.7))))
+    return colorsys.hsv_to_rgb(hue % 1.0, float(np.clip(saturation, 0.0, 0.85)), value)

@@ -1,0 +1,88 @@
+"""Which part of a motion is drawn, and at what rate."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from datagen.grasps.sequence import GraspSequence
+from datagen.sampling.errors import SamplingError
+
+__all__ = ["ClipConfig", "ClipWindow", "clip_windows", "object_movement"]
+
+METRES_PER_RADIAN = 0.3  # travel that counts as much as one radian of turning
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipConfig:
+    """Length and rate of the clips of a motion."""
+
+    n_frames: int
+    fps: tuple[float, ...]  # one is drawn per motion, among those the motion is long enough for
+    before_grasp_s: float  # how much of the approach may be seen, where the object rests on a table
+    preference: float  # 0: any part of the motion; larger: parts in which the object moves most
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipWindow:
+    """Frames of the sequence that are drawn."""
+
+    frames: Int[np.ndarray, "frame"]  # indices into the sequence
+    fps: float
+    supported: bool  # the object lies on a table in at least one drawn frame
+    movement_rad: float  # `object_movement`
+
+    def first_grasped(self, sequence: GraspSequence) -> int:
+        """First drawn frame in which the hand carries the object."""
+        return int(np.searchsorted(self.frames, sequence.grasp_frame))
+
+
+def clip_windows(
+    sequence: GraspSequence, config: ClipConfig, rng: np.random.Generator
+) -> Iterator[ClipWindow]:
+    """Windows in random order, those in which the object moves more coming sooner.
+
+    Frames are the simulated ones nearest to the clip's times, so that contacts are as simulated.
+    A window that begins before the grasp needs a table under the object; sequences that begin in
+    mid-air are drawn from the grasp on. Raises SamplingError when the motion is too short.
+    """
+    first = max(
+        sequence.first_drawn_frame, sequence.grasp_frame - round(config.before_grasp_s * sequence.fps)
+    )
+    if sequence.start == "held":
+        first = max(first, sequence.grasp_frame)
+    n_frames = len(sequence.T_world_from_obj)
+    fitting = [fps for fps in config.fps if first + _span(sequence, config, fps) < n_frames]
+    if not fitting:
+        raise SamplingError(
+            f"motion {sequence.sequence_id}: {n_frames - first} frames at {sequence.fps} fps from "
+            f"frame {first} are too few for clips of {config.n_frames} frames at {config.fps} fps; "
+            "raise clip.fps or lower clip.n_frames"
+        )
+    fps = fitting[rng.integers(len(fitting))]
+    offsets = np.round(np.arange(config.n_frames) * sequence.fps / fps).astype(int)
+    starts = np.unique(np.linspace(max(first, 0), n_frames - 1 - offsets[-1], 24).astype(int))
+    movement = np.array([object_movement(sequence.T_world_from_obj[start + offsets]) for start in starts])
+    # Gumbel noise on log weights: a random order without replacement.
+    keys = config.preference * np.log(np.maximum(movement, 1e-3)) + rng.gumbel(size=len(starts))
+    for index in np.argsort(-keys):
+        start = int(starts[index])
+        yield ClipWindow(
+            frames=start + offsets,
+            fps=fps,
+            supported=start < sequence.grasp_frame,
+            movement_rad=float(movement[index]),
+        )
+
+
+def object_movement(T_world_from_obj: Float[np.ndarray, "frame 4 4"]) -> float:
+    """Largest turn from the first frame (radians) plus largest travel in units of 0.3 m."""
+    R = T_world_from_obj[:, :3, :3]
+    cosine = 0.5 * (np.einsum("tij,ij->t", R, R[0]) - 1.0)
+    travel = np.linalg.norm(T_world_from_obj[:, :3, 3] - T_world_from_obj[0, :3, 3], axis=-1)
+    return float(np.arccos(np.clip(cosine, -1.0, 1.0)).max() + travel.max() / METRES_PER_RADIAN)
+
+
+def _span(sequence: GraspSequence, config: ClipConfig, fps: float) -> int:
+    return round((config.n_frames - 1) * sequence.fps / fps)

@@ -1,0 +1,156 @@
+"""Opening and reading: what was written, from anywhere, and no more bytes than asked for."""
+
+import dataclasses
+import pickle
+from pathlib import Path
+
+import fsspec
+import numpy as np
+import pytest
+from fsspec.implementations.local import LocalFileSystem
+
+from shards.columns import columns_of
+from shards.errors import DatasetNotFoundError, IncompleteShardError, MissingColumnError, SchemaVersionError
+from shards.images import decode_masks
+from shards.reader import open_dataset, open_shard
+from shards.records import check_schema_version, write_record
+from shards.schema import SCHEMA_VERSION, FrameRow
+from tests.shards.synthetic import PROVENANCE, stage_synthetic, synthetic_clip, synthetic_object
+
+
+def test_clips_objects_and_frames_are_those_written(dataset_dir):
+    dataset = open_dataset(dataset_dir)
+    assert [row.object_uid for row in dataset.objects()] == ["ball-0", "ball-1"]
+    clips = list(dataset.clips())
+    assert [clip.clip_id for clip in clips] == [
+        f"motion-00000{m}-camera-0{c}" for m in (0, 1) for c in (0, 1)
+    ]
+    _, written = synthetic_clip(synthetic_object(1), 1, 1, 3, 40)
+    frames = dataset.read_frames("motion-000001-camera-01")
+    for c in columns_of(FrameRow):
+        expected = [getattr(row, c.name) for row in written]
+        if c.dtype not in ("string", "binary"):
+            expected = np.array(expected).astype(c.dtype)
+        np.testing.assert_array_equal(frames[c.name], expected, err_msg=c.name)
+    frame = frames.frame(2)
+    assert frame.row.frame_index == 2
+    assert frame.rgb.shape == (40, 40, 3)
+    np.testing.assert_array_equal(frame.masks.hand_visible, decode_masks(written[2].masks).hand_visible)
+    np.testing.assert_array_equal(frame.geometry.depth_object > 0, frame.masks.object_amodal)
+
+
+def test_only_the_columns_asked_for_are_there(dataset_dir):
+    frames = open_dataset(dataset_dir).read_frames("motion-000000-camera-00", ["T_cam_from_world", "masks"])
+    assert frames["T_cam_from_world"].shape == (3, 4, 4)
+    assert frames.masks(0).hand_amodal.dtype == bool
+    with pytest.raises(MissingColumnError, match=r"'rgb': this column was not read.*add 'rgb'"):
+        frames.rgb(0)
+    with pytest.raises(MissingColumnError, match="this column was not read"):
+        frames.frame(0)
+    with pytest.raises(MissingColumnError, match="no such column"):
+        frames["depth"]
+    with pytest.raises(MissingColumnError, match="'depht'"):
+        open_dataset(dataset_dir).read_frames("motion-000000-camera-00", ["depht"])
+
+
+class CountingFileSystem(LocalFileSystem):
+    """The local disk, counting what is read."""
+
+    protocol = "counting"
+    cachable = False
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.n_bytes = 0
+
+    def cat_file(self, path, start=None, end=None, **kwargs):
+        data = super().cat_file(path, start=start, end=end, **kwargs)
+        self.n_bytes += len(data)
+        return data
+
+
+def test_a_projection_fetches_only_its_own_bytes(dataset_dir):
+    plain = open_dataset(dataset_dir).shards[0]
+    fs = CountingFileSystem()
+    shard = dataclasses.replace(plain, fs=fs)
+    source = shard.source("frames")
+    assert source.num_row_groups == 4  # fetches the footer
+    assert fs.n_bytes == plain.record.files["frames.parquet"].footer_bytes
+    sizes = {
+        source.metadata.row_group(0).column(i).path_in_schema: source.metadata.row_group(0).column(i)
+        for i in range(source.metadata.num_columns)
+    }
+    fs.n_bytes = 0
+    shard.read_frames("motion-000000-camera-00", ["masks"])
+    assert fs.n_bytes == sum(sizes[name].total_compressed_size for name in ("clip_id", "masks"))
+    fs.n_bytes = 0
+    shard.read_frames("motion-000000-camera-00")
+    assert fs.n_bytes == sum(chunk.total_compressed_size for chunk in sizes.values())
+
+
+def test_any_fsspec_location_reads_the_same(dataset_dir):
+    memory = fsspec.filesystem("memory")
+    memory.put(str(dataset_dir), "/remote/two-balls", recursive=True)
+    try:
+        remote, local = open_dataset("memory://remote/two-balls"), open_dataset(dataset_dir)
+        assert [clip.clip_id for clip in remote.clips()] == [clip.clip_id for clip in local.clips()]
+        for clip_id in remote.shards[0].record.clip_ids:
+            assert remote.read_frames(clip_id).arrow.equals(local.read_frames(clip_id).arrow)
+        assert open_dataset("memory://remote/two-balls", shards=[0]).shards[0].record.shard == 0
+        memory.rm("/remote/two-balls/shards/shard-00000/frames.parquet")
+        with pytest.raises(IncompleteShardError, match="the file is missing"):
+            open_dataset("memory://remote/two-balls").read_frames("motion-000000-camera-00")
+    finally:
+        memory.rm("/remote", recursive=True)
+
+
+def test_a_dataset_can_be_sent_to_another_process(dataset_dir):
+    dataset = open_dataset(dataset_dir)
+    dataset.read_frames("motion-000000-camera-00", ["rgb"])  # caches are filled
+    copy = pickle.loads(pickle.dumps(dataset))
+    np.testing.assert_array_equal(
+        copy.read_frames("motion-000000-camera-00").rgb(1),
+        dataset.read_frames("motion-000000-camera-00").rgb(1),
+    )
+
+
+def test_unfinished_shards_do_not_exist(dataset_copy):
+    stage_synthetic(dataset_copy, 7)
+    (dataset_copy / "shards/shard-00001").mkdir()
+    (dataset_copy / "shards/shard-00001/frames.parquet").write_bytes(b"PAR1")
+    assert [shard.record.shard for shard in open_dataset(dataset_copy).shards] == [0]
+    with pytest.raises(DatasetNotFoundError, match=r"shard-00001/shard.json.*unfinished"):
+        open_shard(dataset_copy / "shards/shard-00001")
+
+
+def test_what_is_not_there_is_said_plainly(dataset_dir, tmp_path):
+    with pytest.raises(DatasetNotFoundError, match=r"nowhere/dataset.json: no such file"):
+        open_dataset(tmp_path / "nowhere")
+    with pytest.raises(DatasetNotFoundError, match="no such clip.*found x"):
+        open_dataset(dataset_dir).read_frames("x")
+
+
+@pytest.mark.parametrize(
+    ("version", "message"),
+    [
+        ("1.1.0", "newer schema .expected 1.0.0, found 1.1.0.; update the shards package"),
+        ("2.0.0", "newer schema"),
+        ("0.9.3", "older schema"),
+    ],
+)
+def test_other_schema_versions_are_refused_with_advice(dataset_copy, version, message):
+    path = dataset_copy / "dataset.json"
+    write_record(path, dataclasses.replace(open_dataset(dataset_copy).record, schema_version=version))
+    with pytest.raises(SchemaVersionError, match=message):
+        open_dataset(dataset_copy)
+
+
+def test_patch_versions_are_read():
+    major, minor, _ = SCHEMA_VERSION.split(".")
+    check_schema_version(f"{major}.{minor}.999", where="x")
+
+
+def test_provenance_reaches_the_reader(dataset_dir):
+    dataset = open_dataset(Path(dataset_dir))
+    assert dataset.record.provenance == PROVENANCE
+    assert dataset.shards[0].record.motions[0].timings_s == {"render": 1.5}
