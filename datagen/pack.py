@@ -17,7 +17,7 @@ from datagen.plan import MotionPlan
 from datagen.sampling.motion import SampledMotion
 from datagen.scene import SLEEVE
 from shards.geometry import project_points, transform_points
-from shards.images import Geometry, decode_rgb, encode_geometry, encode_masks, encode_rgb_png
+from shards.images import decode_rgb, encode_geometry, encode_masks, encode_rgb_png
 from shards.schema import ClipRow, FrameRow, ObjectRow
 
 __all__ = ["RenderRecord", "ShardConfig", "clip_id_of", "clip_row", "encoded_rgb", "frame_row", "object_row"]
@@ -209,7 +209,6 @@ def frame_row(
         rgb=rgb,
         masks=encode_masks(geometry.masks),
         geometry=encode_geometry(
-            Geometry(depth=geometry.depth, depth_object=geometry.depth_object, normals_cam=geometry.normals_cam),
-            compression=config.depth_compression,
+            geometry.depth, geometry.depth_object, geometry.normals_cam, compression=config.depth_compression
         ),
     )

@@ -6,9 +6,13 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
+from datagen.hands.arm import ARM_SKIN, HAND_SKIN, SLEEVE
 from datagen.objects.mesh import ObjectMesh
 
 __all__ = [
+    "ARM_SKIN",
+    "HAND_SKIN",
+    "SLEEVE",
     "AreaLight",
     "Background",
     "CameraPath",
@@ -18,8 +22,6 @@ __all__ = [
     "Scene",
     "Table",
 ]
-
-HAND_SKIN, ARM_SKIN, SLEEVE = 0, 1, 2  # values of HandSurface.face_part
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,6 +97,7 @@ class HandLook:
     sleeve_color_rgb: tuple[float, float, float]  # linear
     sleeve_weave: float  # size of the weave; 1: threads 1.2 mm apart
     nail_mask_png: bytes | None = None  # white on the nails, in the UV layout of `skin_png`
+    skin_height_png: bytes | None = None  # relief in the same layout: 128 level, full range about 1 mm
 
 
 @dataclass(frozen=True, kw_only=True)

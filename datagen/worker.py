@@ -18,7 +18,7 @@ from datagen.child import die_with_parent, emit, run_child
 from datagen.config import DatasetConfig, config_sha256, load_config
 from datagen.grasps.synthesise import synthesise_grasp
 from datagen.hands.model import load_open_hand, shape_hand
-from datagen.hands.skin import load_open_skin_basis
+from datagen.hands.skin import load_open_skin
 from datagen.library import open_library
 from datagen.objects.asset import ObjectAsset
 from datagen.objects.fields import learning_targets
@@ -131,7 +131,7 @@ def _sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledM
         return sample_scene(
             found.sequence,
             shaped,
-            load_open_skin_basis(),
+            load_open_skin(),
             asset,
             job.config.sampling,
             dataset_seed=seed,
@@ -166,9 +166,9 @@ def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderReco
     for phase, seconds in summary["seconds"].items():
         timer.add(f"blender.{phase}", seconds)
     return RenderRecord(
-        engine_version=summary["blender"],
-        device=summary["device"],
-        denoiser=summary["denoiser"],
+        engine_version=f"bpy {summary['bpy_version']}",
+        device=", ".join((summary["device"], *summary["device_names"])),
+        denoiser="OpenImageDenoise" if sampled.scene.render.denoise else "none",
         seconds_per_camera=tuple(camera_seconds.tolist()),
     )
 

@@ -4,7 +4,7 @@ A table's columns are the fields of one frozen dataclass, described with `column
 The Arrow schema, the checks on rows and the README table all come from that description.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, TypeVar
 
@@ -101,17 +101,22 @@ def arrow_schema(row_type: type, file_metadata: dict[str, str] | None = None) ->
 
 def table_from_rows(rows: Sequence[Any], row_type: type, *, where: str) -> pa.Table:
     """Check every value against its column and build the Arrow table. `where` names the file in errors."""
-    arrays = []
-    for c in columns_of(row_type):
-        values = [_checked(getattr(row, c.name), c, where=where, row=i) for i, row in enumerate(rows)]
-        arrays.append(_to_arrow(values, c))
+    columns = columns_of(row_type)
+    values = {
+        c.name: [_checked(getattr(row, c.name), c, where=where, row=i) for i, row in enumerate(rows)]
+        for c in columns
+    }
+    _check_named_lengths(columns, values, len(rows), where=where)
+    arrays = [_to_arrow(values[c.name], c) for c in columns]
     return pa.Table.from_arrays(arrays, schema=arrow_schema(row_type))
 
 
-def rows_from_table(table: pa.Table, row_type: type[Row]) -> list[Row]:
+def rows_from_table(table: pa.Table, row_type: type[Row], *, where: str) -> list[Row]:
     """The rows of a table that has all columns of `row_type`; arrays have the column's dtype and shape."""
-    columns = {c.name: column_values(table[c.name], c) for c in columns_of(row_type)}
-    return [row_type(**{name: values[i] for name, values in columns.items()}) for i in range(table.num_rows)]
+    columns = columns_of(row_type)
+    values = {c.name: column_values(table[c.name], c) for c in columns}
+    _check_named_lengths(columns, values, table.num_rows, where=where)
+    return [row_type(**{name: column[i] for name, column in values.items()}) for i in range(table.num_rows)]
 
 
 def column_values(chunked: pa.ChunkedArray, c: Column) -> list[Any] | np.ndarray:
@@ -141,6 +146,23 @@ def markdown_table(row_type: type) -> str:
         choices = f" One of: {', '.join(c.choices)}." if c.choices else ""
         lines.append(f"| `{c.name}` | {c.dtype}{shape}{null} | {c.unit} | {c.frame} | {c.meaning}{choices} |")
     return "\n".join(lines)
+
+
+def _check_named_lengths(
+    columns: Sequence[Column], values: Mapping[str, Any], n_rows: int, *, where: str
+) -> None:
+    """Columns whose first axis has the same name have the same length in each row."""
+    for row in range(n_rows):
+        lengths: dict[str, int] = {}
+        for c in columns:
+            if c.shape and isinstance(c.shape[0], str):
+                found = len(values[c.name][row])
+                expected = lengths.setdefault(c.shape[0], found)
+                if found != expected:
+                    problem = f"another number of '{c.shape[0]}' than the columns before"
+                    raise RowError(
+                        problem, where=where, row=row, column=c.name, expected=expected, found=found
+                    )
 
 
 def _checked(value: Any, c: Column, *, where: str, row: int) -> Any:

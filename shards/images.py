@@ -138,7 +138,7 @@ def decode_geometry(data: bytes) -> Geometry:
     try:
         with OpenEXR.File(io.BytesIO(data), separate_channels=True) as file:
             channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError, OSError, MemoryError, TypeError) as error:
+    except (RuntimeError, ValueError, OSError, MemoryError) as error:
         raise ImageError(f"damaged OpenEXR image: {error}") from error
     wanted = ("Z", "object.Z", "N.X", "N.Y", "N.Z")
     missing = [name for name in wanted if name not in channels]

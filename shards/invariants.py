@@ -41,10 +41,6 @@ def object_problems(row: ObjectRow) -> list[str]:
         problems.append("surface points outside [-0.5, 0.5]")
     if not _all_unit(row.surface_normals):
         problems.append("surface normals are not unit vectors")
-    if not len(row.surface_points) == len(row.surface_normals) == len(row.surface_colors):
-        problems.append("surface points, normals and colours differ in number")
-    if len(row.sdf_points) != len(row.sdf_values):
-        problems.append("sdf_points and sdf_values differ in number")
     return problems + list(_voxel_problems(row))
 
 
@@ -70,11 +66,6 @@ def clip_problems(clip: ClipRow, frames: Frames, split_rule: SplitRule | None) -
         for figure, value in (("min", frames[name].min()), ("mean", frames[name].mean())):
             if abs(getattr(clip, f"{name}_{figure}") - value) > FRACTION_TOLERANCE:
                 problems.append(f"{name}_{figure} is not that of the frames")
-    lights = {
-        len(getattr(clip, f"light_{n}")) for n in ("position_world", "target_world", "power_w", "size_m")
-    }
-    if len(lights | {len(clip.light_color_rgb)}) != 1:
-        problems.append("light columns differ in number")
     if clip.has_table != bool(np.isfinite(clip.table_top_z_m)):
         problems.append("has_table and table_top_z_m disagree")
     return problems

@@ -90,7 +90,7 @@ class Frames(Table):
         for field in fields(FrameRow):
             if field.name not in self.arrow.column_names:
                 self[field.name]  # raises
-        (row,) = rows_from_table(self.arrow.slice(index, 1), FrameRow)
+        (row,) = rows_from_table(self.arrow.slice(index, 1), FrameRow, where=self.where)
         return Frame(row=row, rgb=self.rgb(index), masks=self.masks(index), geometry=self.geometry(index))
 
     def _decoded(self, column: str, index: int, decode: Any) -> Any:
@@ -146,7 +146,8 @@ class Shard:
         return self._sources[name]
 
     def _rows(self, name: str, row_type: type) -> list[Any]:
-        return rows_from_table(self._table(name, None).arrow, row_type)
+        table = self._table(name, None)
+        return rows_from_table(table.arrow, row_type, where=table.where)
 
     def _table(self, name: str, columns: Sequence[str] | None) -> Table:
         source = self._sources[name]

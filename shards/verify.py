@@ -62,29 +62,23 @@ def verify_shard(
 ) -> ShardReport:
     """Check everything about one shard; `split_rule` None leaves the splits unchecked."""
     findings = list(_file_findings(shard))
-    rows = {name: record.rows for name, record in shard.record.files.items()}
     n_frames = 0
     if not findings:  # damaged files are reported once, not again by every row
-        findings += _object_findings(shard)
-        clips = shard.clips()
-        uids = set(shard.read_objects(["object_uid"])["object_uid"])
-        if [clip.clip_id for clip in clips] != list(shard.record.clip_ids):
-            findings.append(_finding(shard, "clips.parquet and shard.json list different clips"))
-        for done, clip in enumerate(clips):
-            if progress:
-                progress(done, len(clips))
-            clip_findings, clip_frames = _clip_findings(shard, clip, uids, split_rule)
-            findings += clip_findings
-            n_frames += clip_frames
-        if progress:
-            progress(len(clips), len(clips))
-        if n_frames != rows["frames.parquet"]:
-            findings.append(
-                _finding(shard, f"frames: expected {rows['frames.parquet']} rows, found {n_frames}")
-            )
+        try:
+            findings += _object_findings(shard)
+            for clip_findings, clip_frames in _clips_findings(shard, split_rule, progress):
+                findings += clip_findings
+                n_frames += clip_frames
+        except ShardError as error:
+            findings.append(Finding(where=shard.path, problem=str(error)))
+        rows = shard.record.files["frames.parquet"].rows
+        if n_frames != rows and not findings:
+            findings.append(_finding(shard, f"expected {rows} frames, found {n_frames}"))
     return ShardReport(
         path=shard.path,
-        n_objects=rows.get("objects.parquet", 0),
+        n_objects=shard.record.files["objects.parquet"].rows
+        if "objects.parquet" in shard.record.files
+        else 0,
         n_clips=len(shard.record.clip_ids),
         n_frames=n_frames,
         n_bytes=sum(record.n_bytes for record in shard.record.files.values()),
@@ -142,15 +136,25 @@ def _object_findings(shard: Shard) -> list[Finding]:
     return findings
 
 
-def _clip_findings(
-    shard: Shard, clip: ClipRow, uids: set[str], split_rule: SplitRule | None
-) -> tuple[list[Finding], int]:
-    frames = shard.read_frames(clip.clip_id)
-    problems = clip_problems(clip, frames, split_rule)
-    if clip.object_uid not in uids:
-        problems.append(f"object {clip.object_uid} is not in objects.parquet")
-    problems += _frame_problems(frames, clip)
-    return [_finding(shard, problem, f"clip {clip.clip_id}") for problem in problems], len(frames)
+def _clips_findings(
+    shard: Shard, split_rule: SplitRule | None, progress: Progress | None
+) -> Iterator[tuple[list[Finding], int]]:
+    """Findings and number of frames of each clip."""
+    clips = shard.clips()
+    uids = set(shard.read_objects(["object_uid"])["object_uid"])
+    if [clip.clip_id for clip in clips] != list(shard.record.clip_ids):
+        yield [_finding(shard, "clips.parquet and shard.json list different clips")], 0
+    for done, clip in enumerate(clips):
+        if progress:
+            progress(done, len(clips))
+        frames = shard.read_frames(clip.clip_id)
+        problems = clip_problems(clip, frames, split_rule)
+        if clip.object_uid not in uids:
+            problems.append(f"object {clip.object_uid} is not in objects.parquet")
+        problems += _frame_problems(frames, clip)
+        yield [_finding(shard, problem, f"clip {clip.clip_id}") for problem in problems], len(frames)
+    if progress:
+        progress(len(clips), len(clips))
 
 
 def _frame_problems(frames: Frames, clip: ClipRow) -> list[str]:
@@ -160,7 +164,7 @@ def _frame_problems(frames: Frames, clip: ClipRow) -> list[str]:
         try:
             problems = frame_problems(frames.frame(index), clip)
         except ShardError as error:
-            problems = [str(error)]
+            problems = [str(error.__cause__ or error)]  # the cause, because it does not repeat the frame
         for problem in problems:
             seen.setdefault(problem, []).append(index)
     return [

@@ -10,7 +10,7 @@ from datagen.blender.geometry import add_mesh, add_object_mesh, add_vertex_attri
 from datagen.blender.lights import add_light
 from datagen.blender.materials import object_material
 from datagen.blender.skin import ARM_BLEND, ARM_COLOR, REST, arm_color_and_blend, skin_material, sleeve_material
-from datagen.blender.surfaces import table_material
+from datagen.blender.surfaces import table_material, table_uv
 from datagen.blender.world import add_world
 from datagen.scene import SLEEVE, CameraPath, Scene, Table
 from datagen.table_mesh import table_mesh
@@ -101,11 +101,12 @@ def _add_table(table: Table) -> None:
     c, s = np.cos(table.yaw_rad), np.sin(table.yaw_rad)
     T_world_from_table[:2, :2] = [[c, -s], [s, c]]
     T_world_from_table[:3, 3] = [*table.center_xy_m, table.top_z_m]
+    verts_table = transform_points(invert_transform(T_world_from_table), mesh.verts_world)
     top = add_mesh(
         "table",
-        verts=transform_points(invert_transform(T_world_from_table), mesh.verts_world),
+        verts=verts_table,
         faces=mesh.faces,
-        corner_uv=np.zeros((len(mesh.faces), 3, 2)),
+        corner_uv=table_uv(table, verts_table, mesh.faces),
         face_material=np.zeros(len(mesh.faces), int),
         materials=[table_material(table)],
     )

@@ -4,7 +4,7 @@ from typing import Any
 
 import bpy
 
-__all__ = ["Graph", "Input"]
+__all__ = ["Graph", "Input", "new_material", "surface"]
 
 # A number, a colour or vector, or the output of another node.
 Input = float | tuple[float, ...] | bpy.types.NodeSocket
@@ -63,9 +63,9 @@ class Graph:
         """A mesh attribute; `output` is "Vector", "Color" or "Fac"."""
         return self.node("ShaderNodeAttribute", {}, attribute_name=name).outputs[output]
 
-    def image(self, image: bpy.types.Image, where: Input | None = None) -> bpy.types.Node:
-        """An image texture at the UV coordinates of the mesh, or at `where`."""
-        return self.node("ShaderNodeTexImage", {} if where is None else {"Vector": where}, image=image)
+    def image(self, image: bpy.types.Image, **settings: Any) -> bpy.types.Node:
+        """An image texture at the UV coordinates of the mesh."""
+        return self.node("ShaderNodeTexImage", {}, image=image, **settings)
 
     def bump(self, height_m: Input, strength: float, normal: Input | None = None) -> bpy.types.NodeSocket:
         """Normal of a surface raised by `height_m` metres."""

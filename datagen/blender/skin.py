@@ -14,7 +14,7 @@ __all__ = ["ARM_BLEND", "ARM_COLOR", "REST", "arm_color_and_blend", "skin_materi
 # Vertex attributes the materials read.
 REST = "rest_m"  # position in the first frame: relief sticks to the skin while the hand moves
 ARM_COLOR = "arm_color"  # linear colour of forearm skin, continued from the wrist
-ARM_BLEND = "arm_blend"  # 1 on the forearm, 0 on the hand
+ARM_BLEND = "arm_blend"  # share of that colour in the forearm, 0 on the hand
 
 # Mean free path of light in skin, metres, for red, green and blue (Jensen et al. 2001, "skin1").
 _SCATTER_M = 0.00367
@@ -26,8 +26,10 @@ _CREASE_M = 0.0009  # per unit of texture brightness: painted creases become rel
 _WRINKLE_M = 0.00035
 _PORE_M = 0.00012
 
+_ARM_DRYER = 0.10  # added roughness: the hand's texture carries relief, the forearm is plain
 _THREAD_M = 0.0012
 _WRIST_BLUR_M = 0.012
+_TEXTURE_FADES_M, _TEXTURE_FADES_TO = 0.035, 0.8
 
 
 def skin_material(look: HandLook) -> bpy.types.Material:
@@ -36,9 +38,7 @@ def skin_material(look: HandLook) -> bpy.types.Material:
     rest = graph.attribute(REST, "Vector")
     texture = graph.image(add_image(look.skin_png, "skin colour", is_color=True)).outputs["Color"]
     blend = graph.attribute(ARM_BLEND, "Fac")
-    mottled = graph.mix(
-        graph.noise(rest, 110.0, detail=3.0), (0.86, 0.80, 0.78), (1.14, 1.16, 1.16)
-    )
+    mottled = graph.mix(graph.noise(rest, 110.0, detail=3.0), (0.90, 0.85, 0.83), (1.10, 1.12, 1.12))
     arm = graph.mix(1.0, graph.attribute(ARM_COLOR, "Color"), mottled, blend="MULTIPLY")
     color = graph.mix(blend, texture, arm)
 
@@ -48,7 +48,8 @@ def skin_material(look: HandLook) -> bpy.types.Material:
     height = _height(graph, texture, blend, wrinkles, pores)
     roughness = graph.math("ADD", look.skin_roughness, graph.remap(wrinkles, 0.3, 0.7, 0.07, -0.07))
     smear = graph.remap(graph.noise(rest, 28.0), 0.3, 0.7, -0.06, 0.06)  # oily and dry patches
-    roughness = graph.math("ADD", roughness, smear, clamp=True)
+    roughness = graph.math("ADD", roughness, smear)
+    roughness = graph.math("ADD", roughness, graph.math("MULTIPLY", blend, _ARM_DRYER), clamp=True)
     if nail is not None:
         glossy = look.skin_roughness + (0.12 - look.skin_roughness) * look.nail_gloss
         roughness = graph.math("ADD", roughness, graph.math("MULTIPLY", nail, graph.math("SUBTRACT", glossy, roughness)))
@@ -120,7 +121,8 @@ def arm_color_and_blend(
     """Colour that continues the texture of the wrist along the forearm, and where it applies.
 
     The colour of a forearm vertex is that of the hand vertices nearest to it, so palm side and
-    back keep their tones; the border is crossed within one ring of faces.
+    back keep their tones. It takes over from the texture, which repeats along the arm, within a
+    few centimetres of the wrist.
     """
     hand_faces = surface_.faces[surface_.face_part == HAND_SKIN]
     hand_uv = surface_.corner_uv[surface_.face_part == HAND_SKIN]
@@ -129,13 +131,13 @@ def arm_color_and_blend(
     arm = np.unique(surface_.faces[surface_.face_part == ARM_SKIN])
 
     blend = np.zeros(len(verts))
-    blend[arm] = 1.0
     color = np.zeros((len(verts), 3))
     if len(arm):
         distance = np.linalg.norm(verts[arm][:, None] - verts[hand][None], axis=-1)
         farther = distance - distance.min(axis=1, keepdims=True)
         weight = np.exp(-0.5 * (farther / _WRIST_BLUR_M) ** 2)
         color[arm] = weight @ hand_color / weight.sum(axis=1, keepdims=True)
+        blend[arm] = _TEXTURE_FADES_TO * np.clip(distance.min(axis=1) / _TEXTURE_FADES_M, 0.0, 1.0)
     return color, blend
 
 

@@ -48,27 +48,32 @@ def add_world(background: Background) -> None:
         "ShaderNodeMapping",
         {"Vector": graph.node("ShaderNodeTexCoord", {}).outputs["Generated"], "Rotation": (0.0, 0.0, background.rotation_rad)},
     ).outputs[0]
-    light = _environment(graph, "light", radiance, direction, "Linear")
-    seen = _environment(graph, "backdrop", _backdrop(radiance), direction, "Cubic")
+    # Mixed as shaders, not as colours: Cycles then skips the branch a ray does not see.
+    light = _environment(graph, "light", radiance, direction, background.strength, "Linear")
+    seen = _environment(graph, "backdrop", _backdrop(radiance), direction, background.strength, "Cubic")
     is_camera = graph.node("ShaderNodeLightPath", {}).outputs["Is Camera Ray"]
-    color = graph.mix(is_camera, light, seen)
-    emitted = graph.node("ShaderNodeBackground", {"Color": color, "Strength": background.strength})
-    graph.node("ShaderNodeOutputWorld", {"Surface": emitted.outputs[0]})
+    mixed = graph.node("ShaderNodeMixShader", {0: is_camera, 1: light, 2: seen}).outputs[0]
+    graph.node("ShaderNodeOutputWorld", {"Surface": mixed})
     world.cycles.sampling_method = "MANUAL"
     world.cycles.sample_map_resolution = 512
 
 
 def _environment(
-    graph: Graph, name: str, radiance: Float32[np.ndarray, "row column 3"], direction: bpy.types.NodeSocket, filtering: str
+    graph: Graph,
+    name: str,
+    radiance: Float32[np.ndarray, "row column 3"],
+    direction: bpy.types.NodeSocket,
+    strength: float,
+    filtering: str,
 ) -> bpy.types.NodeSocket:
     height, width = radiance.shape[:2]
     image = bpy.data.images.new(name, width, height, alpha=False, float_buffer=True, is_data=False)
     image.colorspace_settings.name = "Linear Rec.709"
-    rgba = np.concatenate([radiance[::-1], np.ones_like(radiance[..., :1])], axis=-1)  # Blender's first row is the lowest
-    image.pixels.foreach_set(rgba.reshape(-1))
-    image.pack()
-    inputs = {"Vector": direction}
-    return graph.node("ShaderNodeTexEnvironment", inputs, image=image, interpolation=filtering).outputs["Color"]
+    upward = radiance[::-1]  # Blender's first row is the lowest
+    image.pixels.foreach_set(np.concatenate([upward, np.ones_like(upward[..., :1])], axis=-1).reshape(-1))
+    image.update()
+    texture = graph.node("ShaderNodeTexEnvironment", {"Vector": direction}, image=image, interpolation=filtering)
+    return graph.node("ShaderNodeBackground", {"Color": texture.outputs["Color"], "Strength": strength}).outputs[0]
 
 
 def _read_normalised(path: Path) -> Float32[np.ndarray, "row column 3"]:

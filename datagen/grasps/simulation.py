@@ -184,9 +184,7 @@ class _Squeeze:
     shift_rad: Float[np.ndarray, "hinge"]
 
 
-def _squeeze(
-    world: GraspWorld, recorder: _Recorder, contacts: HandContacts, config: GraspConfig
-) -> _Squeeze:
+def _squeeze(world: GraspWorld, recorder: _Recorder, contacts: HandContacts, config: GraspConfig) -> _Squeeze:
     """Hold the present posture stiffly and press with a force that suits the weight.
 
     Torques come from the transposed contact Jacobians, so that thumb and fingers balance.

@@ -12,11 +12,13 @@ from datagen.grasps.config import GraspConfig
 from datagen.grasps.sequence import StartKind, TableEdge
 from datagen.objects.asset import ObjectAsset
 
-__all__ = ["RestingPoses", "Start", "resting_poses", "sample_start"]
+__all__ = ["START_KINDS", "RestingPoses", "Start", "resting_poses", "sample_start"]
 
 SUPPORT_TOLERANCE_M = 0.001
 FLAT_HEIGHT_M = 0.03  # lower objects leave the fingers little room above the table
+LOW_HEIGHT_M = 0.09  # up to here a hand can close over an overhanging end
 HELD_HEIGHT_M = 0.3
+START_KINDS: tuple[StartKind, ...] = ("table", "edge", "held")
 UPRIGHT_BONUS = 3.0  # household objects usually stand as they were modelled
 
 
@@ -36,6 +38,7 @@ class Start:
     """Where the object is before the hand comes."""
 
     kind: StartKind
+    option: tuple[int, int]  # resting pose, row of START_KINDS
     T_world_from_obj: Float[np.ndarray, "4 4"]
     table_edge: TableEdge | None
 
@@ -85,23 +88,25 @@ def _support_margin(placed: Float[np.ndarray, "vert 3"], com: Float[np.ndarray, 
     return float(-(sides[:, :2] @ com[:2] + sides[:, 2]).max())
 
 
-def sample_start(poses: RestingPoses, config: GraspConfig, rng: np.random.Generator) -> Start:
-    """A random start of a kind that suits the object."""
-    pose = int(rng.choice(len(poses.weight), p=poses.weight))
-    flat = poses.height_m[pose] < FLAT_HEIGHT_M
-    weights = np.array(
+def sample_start(
+    poses: RestingPoses, trust: Float[np.ndarray, "pose 3"], config: GraspConfig, rng: np.random.Generator
+) -> Start:
+    """A random start; `trust` (1 at first) scales the chance of every pose and kind of start."""
+    flat = poses.height_m < FLAT_HEIGHT_M
+    low = poses.height_m < LOW_HEIGHT_M
+    suits = np.stack(
         [
-            config.table_start_weight * (0.3 if flat else 1.0),
-            config.edge_start_weight if flat else 0.0,
-            config.held_start_weight * (1.0 if flat else 0.3),
-        ]
+            config.table_start_weight * np.where(flat, 0.3, 1.0),
+            config.edge_start_weight * np.where(flat, 1.0, np.where(low, 0.1, 0.0)),
+            config.held_start_weight * np.where(flat, 1.0, 0.3),
+        ],
+        axis=1,
     )
+    weights = (poses.weight[:, None] * suits * trust).ravel()
     if weights.sum() <= 0.0:
-        raise ValueError(
-            f"no kind of start is allowed for a {poses.height_m[pose]:.3f} m high object: "
-            "raise table_start_weight"
-        )
-    kind: StartKind = ("table", "edge", "held")[rng.choice(3, p=weights / weights.sum())]
+        raise ValueError("no kind of start is allowed for this object: raise table_start_weight above 0")
+    pose, row = divmod(int(rng.choice(len(weights), p=weights / weights.sum())), len(START_KINDS))
+    kind = START_KINDS[row]
     yaw = Rotation.from_euler("z", rng.uniform(0.0, 2 * np.pi)).as_matrix()
     R = yaw @ poses.R_world_from_obj[pose]
     if kind == "held":
@@ -115,7 +120,7 @@ def sample_start(poses: RestingPoses, config: GraspConfig, rng: np.random.Genera
     if kind == "held":
         T[2, 3] = HELD_HEIGHT_M - com[2]
     edge = _overhang(placed[:, :2] - com[:2], rng) if kind == "edge" else None
-    return Start(kind=kind, T_world_from_obj=T, table_edge=edge)
+    return Start(kind=kind, option=(pose, row), T_world_from_obj=T, table_edge=edge)
 
 
 def _overhang(outline_xy: Float[np.ndarray, "vert 2"], rng: np.random.Generator) -> TableEdge:

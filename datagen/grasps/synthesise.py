@@ -21,12 +21,16 @@ from datagen.grasps.quality import (
 )
 from datagen.grasps.sequence import GraspSequence
 from datagen.grasps.simulation import FRAME_RATE_HZ, Failure, MotionTrace, simulate
-from datagen.grasps.starts import Start, resting_poses, sample_start
+from datagen.grasps.starts import START_KINDS, Start, resting_poses, sample_start
 from datagen.grasps.world import GraspWorld
 from datagen.hands.model import ShapedHand, pose_hand
 from datagen.objects.asset import ObjectAsset
 
 __all__ = ["GraspAttemptReport", "synthesise_grasp"]
+
+# A start that failed is tried less often in what remains of the attempts.
+TRUST_WITHOUT_PLACEMENT = 0.15
+TRUST_AFTER_FAILURE = 0.7
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -78,13 +82,15 @@ def synthesise_grasp(
     )
     samples = sample_surface(obj, rng)
     poses = resting_poses(obj, bench.world.com_obj)
+    trust = np.ones((len(poses.weight), len(START_KINDS)))
     failures: list[Failure] = []
     kept: tuple[GraspSequence, Movement] | None = None
     while kept is None and len(failures) < config.max_attempts:
-        start = sample_start(poses, config, rng)
+        start = sample_start(poses, trust, config, rng)
         proposals = propose(bench.world, samples, library, start, config, rng)
         if not proposals:
             failures.append(Failure.NO_PLACEMENT)
+            trust[start.option] *= TRUST_WITHOUT_PLACEMENT
         for proposal in proposals[: config.simulated_per_start]:
             trace = simulate(bench.world, start, proposal, config, rng)
             outcome = trace if isinstance(trace, Failure) else _judge(bench, start, trace, len(failures) + 1)
@@ -92,6 +98,7 @@ def synthesise_grasp(
                 kept = outcome
                 break
             failures.append(outcome)
+            trust[start.option] *= TRUST_AFTER_FAILURE
             if len(failures) == config.max_attempts:
                 break
     return GraspAttemptReport(

@@ -97,5 +97,5 @@ def _drawn_colors(mesh: ObjectMesh, points_obj: Float[np.ndarray, "point 3"]) ->
     barycentric = igl.barycentric_coordinates(
         nearest, *(np.ascontiguousarray(corners[:, k]) for k in range(3))
     )
-    colors = colors_at(mesh, face, np.clip(barycentric, 0.0, 1.0))
+    colors = colors_at(mesh, face.astype(np.int64), np.clip(barycentric, 0.0, 1.0))
     return np.round(np.clip(colors, 0.0, 1.0) * 255).astype(np.uint8)

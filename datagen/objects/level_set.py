@@ -101,7 +101,7 @@ def _band(verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"], 
         index=index,
         shape=shape,  # type: ignore[arg-type]
         distance=np.sqrt(squared),
-        face=face,
+        face=face.astype(np.int64),  # igl's long long is another type to NumPy
         nearest=nearest,
         points=points,
         origin=origin,
@@ -205,4 +205,4 @@ def _marching(
     negative = values[corners] < 0
     cells = np.ascontiguousarray(corners[negative.any(axis=1) & ~negative.all(axis=1)])
     verts, faces, _ = igl.marching_cubes(values, band.origin + band.voxel * index, cells, 0.0)
-    return verts, faces
+    return verts, faces.astype(np.int64)

@@ -30,6 +30,7 @@ def outward_mesh(mesh: ObjectMesh) -> ObjectMesh:
     """
     mesh = _without_repeats(mesh)
     oriented, patch = igl.bfs_orient(np.ascontiguousarray(mesh.faces, dtype=np.int64))
+    oriented, patch = oriented.astype(np.int64), patch.astype(np.int64)
     flipped = _is_mirrored(mesh.faces, oriented)
     areas = face_areas(mesh.verts_obj, mesh.faces)
     n_patches = int(patch.max()) + 1

@@ -1,7 +1,6 @@
 """From an MTL entry (a model of the 1990s) to a metallic-roughness material."""
 
 from dataclasses import dataclass, field
-from typing import Self
 
 import numpy as np
 
@@ -32,7 +31,7 @@ class MtlEntry:
     maps: dict[str, str] = field(default_factory=dict)  # map_kd, map_bump ... -> file name
 
     @classmethod
-    def from_words(cls, name: str, words: dict[str, list[str]]) -> Self:
+    def from_words(cls, name: str, words: dict[str, list[str]]) -> "MtlEntry":
         """Parse the words after each keyword; ValueError where a number is not one."""
 
         def rgb(key: str, default: RGB) -> RGB:

@@ -49,7 +49,14 @@ REFERENCE_PREPARATION = PreparationConfig(
         max_faces=12000,
     ),
     convex=ConvexConfig(
-        thresholds=(0.06, 0.03), max_hulls=16, max_hull_verts=48, max_excess_m=0.002, max_faces=3000, seed=0
+        thresholds=(0.05, 0.025),
+        max_hulls=24,
+        max_hull_verts=96,
+        hull_tolerance_m=0.0002,
+        max_excess_m=0.002,
+        max_faces=4000,
+        mcts_iterations=30,
+        seed=0,
     ),
 )
 

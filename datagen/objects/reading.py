@@ -14,6 +14,7 @@ from datagen.objects.errors import ObjectError
 from datagen.objects.file_mesh import FileMesh
 from datagen.objects.gltf import read_gltf
 from datagen.objects.mesh import Material, ObjectMesh
+from datagen.objects.surface import linear_from_srgb
 from datagen.objects.vertex_colors import baked_vertex_colors
 from datagen.objects.wavefront import read_obj
 
@@ -82,14 +83,13 @@ def _read_ply_or_stl(path: Path) -> FileMesh:
         loaded = trimesh.Trimesh()  # a point cloud: refused below for having no faces
     faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     colors = None
-    if loaded.visual.kind in ("vertex", "face"):
-        # PLY colours are display colours by custom.
-        shown = np.asarray(loaded.visual.to_color().vertex_colors, dtype=np.float64)[:, :3] / 255.0
-        if loaded.visual.kind == "face":
-            by_face = np.asarray(loaded.visual.face_colors, dtype=np.float64)[:, :3] / 255.0
-            colors = np.repeat(by_face[:, None], 3, axis=1) ** 2.2
-        else:
-            colors = shown[faces] ** 2.2
+    # PLY colours are display colours by custom.
+    if loaded.visual.kind == "face":
+        by_face = np.asarray(loaded.visual.face_colors, dtype=np.float64)[:, :3] / 255.0
+        colors = np.repeat(linear_from_srgb(by_face)[:, None], 3, axis=1)
+    elif loaded.visual.kind == "vertex":
+        by_vertex = np.asarray(loaded.visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
+        colors = linear_from_srgb(by_vertex)[faces]
     plain = Material(name="plain", base_color_rgba=(0.6, 0.6, 0.6, 1.0))
     return FileMesh(
         verts_file=np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3),

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+import fast_simplification
 import igl
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +12,7 @@ from datagen.objects.errors import ObjectError
 from datagen.objects.level_set import LevelSetConfig, level_set_surface
 from datagen.objects.surface import face_areas, face_normals
 
-__all__ = ["ClosedSurface", "SolidConfig", "closed_surface", "signed_distance"]
+__all__ = ["ClosedSurface", "SolidConfig", "closed_surface", "decimated_closed", "signed_distance"]
 
 MAX_COMPONENTS = 400  # more are remeshed: their union costs more than a level set
 
@@ -22,7 +23,7 @@ class SolidConfig:
 
     level_set: LevelSetConfig
     tolerance_m: float  # simplification moves the surface by less than this
-    max_faces: int  # simplification goes on, with up to 4x the tolerance, until this is met
+    max_faces: int  # quadric decimation beyond this, where the surface stays closed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,11 +57,15 @@ def closed_surface(
             expected="an object with some thickness",
             action="Check the mesh in a viewer; give sheets a thickness.",
         )
-    solid = _simplified(solid, config)
-    mesh = solid.to_mesh64()
+    mesh = _simplified(solid, config).to_mesh64()
+    closed_verts, closed_faces = decimated_closed(
+        np.array(mesh.vert_properties[:, :3], dtype=np.float64),
+        np.array(mesh.tri_verts, dtype=np.int64),
+        config.max_faces,
+    )
     return ClosedSurface(
-        verts_obj=np.array(mesh.vert_properties[:, :3], dtype=np.float64),
-        faces=np.array(mesh.tri_verts, dtype=np.int64),
+        verts_obj=closed_verts,
+        faces=closed_faces,
         watertight_source=watertight_source,
     )
 
@@ -121,14 +126,30 @@ def _without_voids_and_crumbs(solid: Manifold, voxel_m: float) -> Manifold:
 
 def _simplified(solid: Manifold, config: SolidConfig) -> Manifold:
     solid = solid.as_original()
-    for factor in (1.0, 2.0, 4.0):
-        simple = solid.simplify(config.tolerance_m * factor)
-        if simple.is_empty() or simple.volume() <= 0:
-            break
-        solid = simple
-        if solid.num_tri() <= config.max_faces:
-            break
-    return solid
+    simple = solid.simplify(config.tolerance_m)
+    return solid if simple.is_empty() or simple.volume() <= 0 else simple
+
+
+def decimated_closed(
+    verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"], max_faces: int
+) -> tuple[Float[np.ndarray, "out_vert 3"], Int[np.ndarray, "out_face 3"]]:
+    """Quadric decimation of a closed surface; given back unchanged where it would not stay closed."""
+    if len(faces) <= max_faces:
+        return verts, faces
+    volume = _signed_volume(verts, faces)
+    light_verts, light_faces = fast_simplification.simplify(
+        verts.astype(np.float32), faces.astype(np.int32), target_count=max_faces, agg=5
+    )
+    light = _manifold(light_verts.astype(np.float64), light_faces.astype(np.int64))
+    if light is None or abs(light.volume() - volume) > 0.03 * volume:
+        return verts, faces
+    mesh = light.to_mesh64()
+    return np.array(mesh.vert_properties[:, :3], dtype=np.float64), np.array(mesh.tri_verts, dtype=np.int64)
+
+
+def _signed_volume(verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"]) -> float:
+    a, b, c = (verts[faces[:, k]] for k in range(3))
+    return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6.0)
 
 
 def signed_distance(

@@ -113,7 +113,9 @@ def read_model(library: Path, entry: CatalogueEntry) -> FileMesh:
                     target = Path(folder, name)
                     target.parent.mkdir(parents=True, exist_ok=True)
                     target.write_bytes(archive.read(name))
-        file_mesh = read_obj(Path(folder, entry.model))
+        # A few published models name images that were never part of them; Sweet Home 3D
+        # shows those materials in their plain colour.
+        file_mesh = read_obj(Path(folder, entry.model), ignore_missing_images=True)
     verts = file_mesh.verts_file @ entry.rotation.T
     used = verts[np.unique(file_mesh.faces)]
     extent = np.ptp(used, axis=0)

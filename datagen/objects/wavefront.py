@@ -22,6 +22,7 @@ class _Reading:
     """Growing lists while the lines of one OBJ file are read."""
 
     path: Path
+    ignore_missing_images: bool
     verts: list[tuple[float, ...]]
     colors: list[tuple[float, ...]]
     uvs: list[tuple[float, ...]]
@@ -30,9 +31,13 @@ class _Reading:
     libraries: list[str]
 
 
-def read_obj(path: Path) -> FileMesh:
-    """All faces of an OBJ file with the materials of its MTL files; polygons are triangulated."""
-    reading = _Reading(path, [], [], [], [], {}, [])
+def read_obj(path: Path, *, ignore_missing_images: bool = False) -> FileMesh:
+    """All faces of an OBJ file with the materials of its MTL files; polygons are triangulated.
+
+    With `ignore_missing_images` a material whose image is absent keeps its plain colour; without,
+    it is refused by name.
+    """
+    reading = _Reading(path, ignore_missing_images, [], [], [], [], {}, [])
     material = -1
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
     for number, line in enumerate(text.splitlines(), start=1):
@@ -68,9 +73,8 @@ def _read_element(reading: _Reading, keyword: str, words: list[str], material: i
         verts = [_index(corner[0], len(reading.verts)) for corner in corners]
         has_uv = all(len(corner) > 1 and corner[1] for corner in corners)
         uvs = [_index(corner[1], len(reading.uvs)) for corner in corners] if has_uv else []
-        if len(verts) < 3:
-            raise ValueError("a face with fewer than three corners")
-        reading.polygons.append((material, verts, uvs))
+        if len(verts) >= 3:  # two corners draw nothing
+            reading.polygons.append((material, verts, uvs))
 
 
 def _index(word: str, count: int) -> int:
@@ -145,15 +149,17 @@ def _material(reading: _Reading, entries: dict[str, MtlEntry], name: str) -> Mat
                 action="Add the material to the MTL file or remove the usemtl line.",
             )
         entry = MtlEntry(name=name, kd=GREY.kd)
-    images = {key: _image_bytes(reading.path, value) for key, value in entry.maps.items()}
-    return material_from_mtl(entry, images)
+    images = {key: _image_bytes(reading, value) for key, value in entry.maps.items()}
+    return material_from_mtl(entry, {key: image for key, image in images.items() if image is not None})
 
 
-def _image_bytes(obj_path: Path, name: str) -> bytes:
-    path = obj_path.parent / name.replace("\\", "/")
+def _image_bytes(reading: _Reading, name: str) -> bytes | None:
+    path = reading.path.parent / name.replace("\\", "/")
     if not path.is_file():
+        if reading.ignore_missing_images:
+            return None
         raise ObjectError(
-            obj_path,
+            reading.path,
             f"texture {name!r} is missing",
             expected=f"an image at {path}",
             action="Put the image there or remove its map_ line from the MTL file.",

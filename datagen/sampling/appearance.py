@@ -7,9 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.hands.arm import ArmStyle
+from datagen.hands.skin import (
+    SkinBasis,
+    decode_skin,
+    open_nail_mask_png,
+    sample_skin_coefficients,
+)
+from datagen.scene import HandLook
+from shards.png import encode_png
 
-__all__ = ["AppearanceConfig", "sample_arm_style", "sample_betas", "sample_sleeve_color"]
+__all__ = ["AppearanceConfig", "sample_arm_style", "sample_betas", "sample_look"]
 
+OPEN_SKIN = "open"  # SkinBasis.name; its nails are known, those of another UV layout are not
 MAX_BETA = 2.0  # in standard deviations: beyond it shapes are caricatures
 
 
@@ -51,7 +60,28 @@ def sample_arm_style(rng: np.random.Generator, config: AppearanceConfig) -> ArmS
     )
 
 
-def sample_sleeve_color(rng: np.random.Generator) -> tuple[float, float, float]:
+def sample_look(
+    skins: SkinBasis,
+    config: AppearanceConfig,
+    skin_rng: np.random.Generator,
+    sleeve_rng: np.random.Generator,
+) -> HandLook:
+    """Skin and cloth of one motion."""
+    coefficients = sample_skin_coefficients(skin_rng, skins)
+    return HandLook(
+        skin_png=encode_png(decode_skin(skins, coefficients), level=1),
+        skin_coefficients=coefficients,
+        skin_roughness=float(skin_rng.uniform(*config.skin_roughness)),
+        subsurface=float(skin_rng.uniform(*config.subsurface)),
+        bump=float(skin_rng.uniform(*config.bump)),
+        nail_gloss=float(skin_rng.uniform(*config.nail_gloss)),
+        sleeve_color_rgb=_sleeve_color(sleeve_rng),
+        sleeve_weave=float(sleeve_rng.uniform(*config.sleeve_weave)),
+        nail_mask_png=open_nail_mask_png() if skins.name == OPEN_SKIN else None,
+    )
+
+
+def _sleeve_color(rng: np.random.Generator) -> tuple[float, float, float]:
     """Linear colour of cloth: half of all clothes are black, white, grey or blue."""
     if rng.uniform() < 0.5:
         hue, saturation = rng.normal(0.61, 0.02), rng.choice([0.05, 0.55]) * rng.uniform(0.5, 1.5)

@@ -52,11 +52,11 @@ class CamerasConfig:
     free_elevation_deg: tuple[float, float]  # without a table (egocentric keeps its own)
     table_clearance_m: float  # cameras stay so far above the plane of the table
     arm_clearance_m: float
-    min_visible: float  # visible fraction of the object, worst probed frame
+    min_visible: float  # visible fraction of the object, worst frame
     min_visible_mean: float
-    min_object_size: float  # fraction; square root of the object's area, worst probed frame
+    min_object_size: float  # fraction; square root of the object's area, worst frame
     attempts: int  # candidates per camera
-    probe_frames: int
+    arm_end_attempts: int  # so many of them may be refused for showing where the drawn arm ends
     probe_rays: int  # rays across the image
 
     def __post_init__(self) -> None:
@@ -79,7 +79,7 @@ class Surroundings:
 
 @dataclass(frozen=True, kw_only=True)
 class CameraFigures:
-    """What was measured of one camera that was kept. `visible_*` are those of the coarse probe."""
+    """What was measured of one camera over all frames; visibility by coarse rays."""
 
     kind: CameraKind
     attempts: int
@@ -88,7 +88,8 @@ class CameraFigures:
     min_margin_px: float
     visible_fraction_min: float
     visible_fraction_mean: float
-    object_size_px: float  # worst probed frame
+    object_size_px: float  # worst frame
+    arm_end_seen: bool  # the end of the drawn arm is in the picture in some frame
     distance_m: tuple[float, float]  # camera to object centre: least, greatest
     clearance_m: float  # to the arm and, with a table, to its plane
 
@@ -113,6 +114,7 @@ def sample_cameras(
 ) -> tuple[tuple[CameraPath, ...], tuple[CameraFigures, ...]]:
     """One camera per generator: the first acceptable of `config.attempts` candidates each.
 
+    Among the first `config.arm_end_attempts` one that does not show the end of the arm is preferred.
     Azimuths are spread around the subject. Raises SamplingError, with the figures of the best
     candidate, when a camera finds none.
     """
@@ -137,6 +139,7 @@ def _sample_camera(
     spread = np.pi / config.n_cameras
     kind = KINDS[0]
     best: CameraFigures | None = None
+    second_choice: tuple[CameraPath, CameraFigures] | None = None
     for attempt in range(1, config.attempts + 1):
         # A kind that cannot see this grasp gives way to the others after half the attempts.
         if attempt == 1 or 2 * attempt > config.attempts:
@@ -145,7 +148,11 @@ def _sample_camera(
         path = _candidate(config, subject, around, rng, kind, near_azimuth)
         figures = _measure(config, subject, probe, around, path, attempt)
         if not figures.objections(config):
-            return path, figures
+            if not figures.arm_end_seen or attempt > config.arm_end_attempts:
+                return path, figures
+            second_choice = second_choice or (path, figures)
+        if second_choice is not None and attempt >= config.arm_end_attempts:
+            return second_choice
         if best is None or figures.visible_fraction_mean > best.visible_fraction_mean:
             best = figures
     assert best is not None
@@ -222,6 +229,7 @@ def _measure(
         visible_fraction_min=float(seen.visible_fraction.min()),
         visible_fraction_mean=float(seen.visible_fraction.mean()),
         object_size_px=float(seen.object_size_px.min()),
+        arm_end_seen=bool(seen.arm_end_seen.any()),
         distance_m=(float(distance.min()), float(distance.max())),
         clearance_m=clearance,
     )

@@ -11,6 +11,7 @@ from datagen.sampling.errors import SamplingError
 
 __all__ = ["ClipConfig", "ClipWindow", "clip_windows", "object_movement"]
 
+CANDIDATES, PICKUPS = 24, 5
 METRES_PER_RADIAN = 0.3  # travel that counts as much as one radian of turning
 
 
@@ -20,7 +21,8 @@ class ClipConfig:
 
     n_frames: int
     fps: tuple[float, ...]  # one is drawn per motion, among those the motion is long enough for
-    before_grasp_s: float  # how much of the approach may be seen, where the object rests on a table
+    pickup_probability: float  # of a clip that begins while the object still lies on a table
+    before_grasp_s: float  # how much of the approach may be seen then
     preference: float  # 0: any part of the motion; larger: parts in which the object moves most
 
 
@@ -44,11 +46,13 @@ def clip_windows(
     """Windows in random order, those in which the object moves more coming sooner.
 
     Frames are the simulated ones nearest to the clip's times, so that contacts are as simulated.
-    A window that begins before the grasp needs a table under the object; sequences that begin in
-    mid-air are drawn from the grasp on. Raises SamplingError when the motion is too short.
+    A window that begins before the grasp needs a table under the object; with `pickup_probability`
+    these come first, otherwise last. Sequences that begin in mid-air are drawn from the grasp on.
+    Raises SamplingError when the motion is too short.
     """
+    wants_pickup = rng.uniform() < config.pickup_probability
     first = max(
-        sequence.first_drawn_frame, sequence.grasp_frame - round(config.before_grasp_s * sequence.fps)
+        0, sequence.first_drawn_frame, sequence.grasp_frame - round(config.before_grasp_s * sequence.fps)
     )
     if sequence.start == "held":
         first = max(first, sequence.grasp_frame)
@@ -62,16 +66,20 @@ def clip_windows(
         )
     fps = fitting[rng.integers(len(fitting))]
     offsets = np.round(np.arange(config.n_frames) * sequence.fps / fps).astype(int)
-    starts = np.unique(np.linspace(max(first, 0), n_frames - 1 - offsets[-1], 24).astype(int))
+    last = n_frames - 1 - offsets[-1]
+    starts = np.unique(np.linspace(first, last, CANDIDATES).astype(int))
+    if first < sequence.grasp_frame <= last:
+        starts = np.union1d(starts, np.linspace(first, sequence.grasp_frame, PICKUPS).astype(int))
     movement = np.array([object_movement(sequence.T_world_from_obj[start + offsets]) for start in starts])
     # Gumbel noise on log weights: a random order without replacement.
     keys = config.preference * np.log(np.maximum(movement, 1e-3)) + rng.gumbel(size=len(starts))
-    for index in np.argsort(-keys):
+    supported = starts < sequence.grasp_frame
+    for index in np.lexsort((-keys, supported != wants_pickup)):
         start = int(starts[index])
         yield ClipWindow(
             frames=start + offsets,
             fps=fps,
-            supported=start < sequence.grasp_frame,
+            supported=bool(supported[index]),
             movement_rad=float(movement[index]),
         )
 

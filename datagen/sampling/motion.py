@@ -8,20 +8,20 @@ from jaxtyping import Float, Int
 from datagen.grasps.sequence import GraspSequence
 from datagen.hands.arm import DressedHand, dress_hand
 from datagen.hands.model import ShapedHand
-from datagen.hands.skin import SkinModel, decode_skin, sample_skin_coefficients
+from datagen.hands.skin import SkinBasis
 from datagen.objects.asset import ObjectAsset
 from datagen.raycast import TriangleCaster
-from datagen.sampling.appearance import AppearanceConfig, sample_arm_style, sample_sleeve_color
+from datagen.sampling.appearance import sample_arm_style, sample_look
 from datagen.sampling.cameras import CameraFigures, CamerasConfig, Surroundings, sample_cameras
 from datagen.sampling.clip import clip_windows
 from datagen.sampling.config import RenderConfig, SamplingConfig
 from datagen.sampling.errors import SamplingError
 from datagen.sampling.framing import Subject
 from datagen.sampling.lights import sample_light
-from datagen.sampling.placement import Placement, object_mesh_hull, place
+from datagen.sampling.placement import Placement, arm_end_verts, object_mesh_hull, place
 from datagen.sampling.streams import Stream, stream_rng
 from datagen.sampling.visibility import VisibilityProbe
-from datagen.scene import CameraPath, HandLook, HandSurface, RenderSettings, Scene
+from datagen.scene import CameraPath, HandSurface, RenderSettings, Scene
 
 __all__ = ["SampledMotion", "sample_scene"]
 
@@ -47,7 +47,7 @@ class SampledMotion:
 def sample_scene(
     sequence: GraspSequence,
     hand: ShapedHand,
-    skins: SkinModel,
+    skins: SkinBasis,
     asset: ObjectAsset,
     config: SamplingConfig,
     *,
@@ -90,7 +90,7 @@ def sample_scene(
             n_hand_verts=dressed.n_hand_verts,
         ),
         hand_verts_world=placed.hand_verts_world,
-        hand_look=_look(skins, config.appearance, rng(Stream.SKIN), rng(Stream.SLEEVE, 1)),
+        hand_look=sample_look(skins, config.appearance, rng(Stream.SKIN), rng(Stream.SLEEVE, 1)),
         cameras=cameras,
         lights=lights,
         background=background,
@@ -119,8 +119,9 @@ def _require_same_hand(sequence: GraspSequence, hand: ShapedHand) -> None:
     ours = (hand.model.name, hand.model.side)
     if theirs != ours or not np.array_equal(sequence.betas, hand.betas):
         raise SamplingError(
-            f"motion {sequence.sequence_id} is of hand {theirs} with betas {np.round(sequence.betas, 3).tolist()}, "
-            f"found {ours} with {np.round(hand.betas, 3).tolist()}; pass the hand it was made with"
+            f"motion {sequence.sequence_id} is of hand {theirs} with betas "
+            f"{np.round(sequence.betas, 3).tolist()}, found {ours} with {np.round(hand.betas, 3).tolist()}; "
+            "pass the hand it was made with"
         )
 
 
@@ -133,7 +134,7 @@ def _cameras(
     T_world_from_obj: Float[np.ndarray, "frame 4 4"],
     rngs: list[np.random.Generator],
 ) -> tuple[tuple[CameraPath, ...], tuple[CameraFigures, ...]]:
-    n_frames, n_hand = len(T_world_from_obj), dressed.n_hand_verts
+    n_hand = dressed.n_hand_verts
     hand, arm = placed.hand_verts_world[:, :n_hand], placed.hand_verts_world[:, n_hand:]
     middle = 0.5 * (hull.min(axis=0) + hull.max(axis=0))
     probe = VisibilityProbe(
@@ -142,7 +143,7 @@ def _cameras(
         T_world_from_obj=T_world_from_obj,
         hand_verts_world=placed.hand_verts_world,
         hand_faces=dressed.faces,
-        frames=np.unique(np.linspace(0, n_frames - 1, config.probe_frames).round().astype(int)),
+        arm_end=arm_end_verts(placed.hand_verts_world[0], n_hand, placed.posed.joints_world[0, 0]),
         rays_across=config.probe_rays,
     )
     wrist_to_elbow = arm.mean(axis=(0, 1)) - placed.posed.joints_world[:, 0].mean(axis=0)
@@ -157,22 +158,6 @@ def _cameras(
         fps=placed.window.fps,
     )
     return sample_cameras(config, subject, probe, around, rngs)
-
-
-def _look(
-    skins: SkinModel, config: AppearanceConfig, skin_rng: np.random.Generator, sleeve_rng: np.random.Generator
-) -> HandLook:
-    coefficients = sample_skin_coefficients(skins, skin_rng)
-    return HandLook(
-        skin_png=decode_skin(skins, coefficients),
-        skin_coefficients=coefficients,
-        skin_roughness=float(skin_rng.uniform(*config.skin_roughness)),
-        subsurface=float(skin_rng.uniform(*config.subsurface)),
-        bump=float(skin_rng.uniform(*config.bump)),
-        nail_gloss=float(skin_rng.uniform(*config.nail_gloss)),
-        sleeve_color_rgb=sample_sleeve_color(sleeve_rng),
-        sleeve_weave=float(sleeve_rng.uniform(*config.sleeve_weave)),
-    )
 
 
 def _render(config: RenderConfig, rng: np.random.Generator) -> RenderSettings:

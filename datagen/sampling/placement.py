@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull, QhullError
 
 from datagen.grasps.sequence import GraspSequence, TableEdge
@@ -21,8 +21,9 @@ from datagen.sampling.tables import TableConfig, sample_table
 from datagen.scene import Table
 from shards.geometry import transform_points
 
-__all__ = ["Placement", "object_mesh_hull", "place"]
+__all__ = ["Placement", "arm_end_verts", "object_mesh_hull", "place"]
 
+ARM_END_M = 0.015
 SINK_M = 0.003  # skin may press so far into a table: less than the eye can tell
 
 
@@ -63,10 +64,13 @@ def place(
         table = None
         if rest is not None or wants_table:
             table = _table(sequence, object_hull_obj, obj, rest, lowest, config, rng)
-        return Placement(window=window, posed=posed, hand_verts_world=hand, object_verts_world=obj, table=table)
+        return Placement(
+            window=window, posed=posed, hand_verts_world=hand, object_verts_world=obj, table=table
+        )
     raise SamplingError(
         f"motion {sequence.sequence_id}: in all {len(sunk_m)} windows hand or arm sink into the table, by "
-        f"{min(sunk_m):.4f} m at least (allowed {SINK_M} m); shorten appearance.forearm_length_m or leave it out"
+        f"{min(sunk_m):.4f} m at least (allowed {SINK_M} m); "
+        "shorten appearance.forearm_length_m or leave the motion out"
     )
 
 
@@ -77,6 +81,16 @@ def object_mesh_hull(mesh: ObjectMesh) -> Float[np.ndarray, "hull 3"]:
         return used[ConvexHull(used).vertices]
     except QhullError:  # flat: every vertex counts
         return used
+
+
+def arm_end_verts(
+    hand_verts_world: Float[np.ndarray, "vert 3"], n_hand_verts: int, wrist_world: Float[np.ndarray, "3"]
+) -> Int[np.ndarray, "end"]:
+    """Vertices of the closed end of forearm or sleeve: the farthest ones along the arm."""
+    arm = hand_verts_world[n_hand_verts:] - wrist_world
+    axis = arm.mean(axis=0) / np.linalg.norm(arm.mean(axis=0))
+    along = arm @ axis
+    return n_hand_verts + np.flatnonzero(along > along.max() - ARM_END_M)
 
 
 def _pose(sequence: GraspSequence, dressed: DressedHand, window: ClipWindow) -> PosedHand:
@@ -119,7 +133,7 @@ def _table(
         T = sequence.T_world_from_obj[sequence.first_drawn_frame]
         began = transform_points(T, object_hull_obj)
         top = float(began[:, 2].min())
-        if lowest_m < top:
+        if lowest_m < top - SINK_M:
             top = None
     if top is None:
         top = lowest_m - rng.uniform(*config.lowered_m)

@@ -42,7 +42,7 @@ def frustum_report(scene: Scene) -> tuple[CameraReport, ...]:
         T_world_from_obj=scene.T_world_from_obj,
         hand_verts_world=scene.hand_verts_world,
         hand_faces=scene.hand_surface.faces,
-        frames=np.arange(len(hand)),
+        arm_end=np.arange(0),
         rays_across=PROBE_RAYS,
     )
     center = object_center_world(scene)

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from jaxtyping import Float
 
 from datagen.grasps.sequence import TableEdge
 from datagen.scene import Table
@@ -73,7 +74,7 @@ def sample_table(
         shift[0] = 0.5 * size[0]
     c, s = np.cos(yaw), np.sin(yaw)
     anchor = np.asarray(under_xy_m if edge is None else edge.point_xy_m)
-    center = anchor - np.array([[c, -s], [s, c]]) @ shift
+    center: Float[np.ndarray, "2"] = anchor - np.array([[c, -s], [s, c]]) @ shift
     material = _material(config, rng)
     color_a, color_b = _colors(material, rng)
     roughness = {"wood": (0.3, 0.65), "stone": (0.08, 0.4), "cloth": (0.75, 0.95), "laminate": (0.2, 0.55)}[

@@ -16,14 +16,18 @@ def python(code: str) -> list[str]:
 
 def test_events_arrive_and_other_output_goes_to_the_log(tmp_path):
     events = []
-    code = "from datagen.child import emit; print('chatter'); emit(phase='render', done=1); emit(phase='done')"
+    code = (
+        "from datagen.child import emit; print('chatter'); emit(phase='render', done=1); emit(phase='done')"
+    )
     run_child(python(code), log=tmp_path / "child.log", on_event=events.append)
     assert events == [{"phase": "render", "done": 1}, {"phase": "done"}]
     assert (tmp_path / "child.log").read_text() == "chatter\n"
 
 
 def test_failure_carries_status_and_end_of_log(tmp_path):
-    code = "import sys; [print(i, file=sys.stderr) for i in range(100)]; sys.exit('texture missing: wood.png')"
+    code = (
+        "import sys; [print(i, file=sys.stderr) for i in range(100)]; sys.exit('texture missing: wood.png')"
+    )
     with pytest.raises(ChildError, match="texture missing: wood.png") as caught:
         run_child(python(code), log=tmp_path / "child.log", on_event=print)
     assert caught.value.status == 1

@@ -47,10 +47,15 @@ def test_killed_before_every_file_system_call(tmp_path):
 def test_killed_at_random_times_until_it_is_done(tmp_path):
     """kill -9 from outside, also in the middle of Arrow's own writes."""
     rng = random.Random(0)
-    start_making(tmp_path / "reference").wait()
+    process = start_making(tmp_path / "reference")
+    assert process.stdout is not None
+    process.stdout.readline()
+    begin = time.monotonic()
+    process.wait()
+    duration_s = time.monotonic() - begin
     reference = tree_hashes(tmp_path / "reference")
     kills = 0
-    for number in range(12):
+    for number in range(6):
         root = tmp_path / f"run-{number}"
         log = tmp_path / f"{root.name}.log"
         finished: set[int] = set()
@@ -59,7 +64,7 @@ def test_killed_at_random_times_until_it_is_done(tmp_path):
             process = start_making(root)
             assert process.stdout is not None
             process.stdout.readline()
-            time.sleep(rng.uniform(0.0, 0.15))
+            time.sleep(rng.uniform(0.0, 1.5 * duration_s))
             if process.poll() is None:
                 os.kill(process.pid, signal.SIGKILL)
             status = process.wait()
@@ -71,7 +76,7 @@ def test_killed_at_random_times_until_it_is_done(tmp_path):
             if status == 0:
                 break
         assert tree_hashes(root) == reference
-    assert kills > 20
+    assert kills > 3
 
 
 def start_making(root: Path) -> subprocess.Popen:

@@ -45,11 +45,11 @@ def test_only_the_columns_asked_for_are_there(dataset_dir):
     assert frames.masks(0).hand_amodal.dtype == bool
     with pytest.raises(MissingColumnError, match=r"'rgb': this column was not read.*add 'rgb'"):
         frames.rgb(0)
-    with pytest.raises(MissingColumnError, match="this column was not read"):
+    with pytest.raises(MissingColumnError, match=r"this column was not read"):
         frames.frame(0)
-    with pytest.raises(MissingColumnError, match="no such column"):
+    with pytest.raises(MissingColumnError, match=r"no such column"):
         frames["depth"]
-    with pytest.raises(MissingColumnError, match="'depht'"):
+    with pytest.raises(MissingColumnError, match=r"'depht'"):
         open_dataset(dataset_dir).read_frames("motion-000000-camera-00", ["depht"])
 
 
@@ -98,7 +98,7 @@ def test_any_fsspec_location_reads_the_same(dataset_dir):
             assert remote.read_frames(clip_id).arrow.equals(local.read_frames(clip_id).arrow)
         assert open_dataset("memory://remote/two-balls", shards=[0]).shards[0].record.shard == 0
         memory.rm("/remote/two-balls/shards/shard-00000/frames.parquet")
-        with pytest.raises(IncompleteShardError, match="the file is missing"):
+        with pytest.raises(IncompleteShardError, match=r"the file is missing"):
             open_dataset("memory://remote/two-balls").read_frames("motion-000000-camera-00")
     finally:
         memory.rm("/remote", recursive=True)
@@ -126,7 +126,7 @@ def test_unfinished_shards_do_not_exist(dataset_copy):
 def test_what_is_not_there_is_said_plainly(dataset_dir, tmp_path):
     with pytest.raises(DatasetNotFoundError, match=r"nowhere/dataset.json: no such file"):
         open_dataset(tmp_path / "nowhere")
-    with pytest.raises(DatasetNotFoundError, match="no such clip.*found x"):
+    with pytest.raises(DatasetNotFoundError, match=r"no such clip.*found x"):
         open_dataset(dataset_dir).read_frames("x")
 
 

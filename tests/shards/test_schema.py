@@ -50,6 +50,9 @@ def test_joint_and_digit_names():
     assert JOINTS[16:] == tuple(f"{digit}_tip" for digit in DIGITS)
 
 
+BALL = synthetic_object(0)
+
+
 def rows():
     object_row = synthetic_object(0, mesh=False)
     clip, frames = synthetic_clip(object_row, 0, 0, 2, 24)
@@ -60,7 +63,7 @@ def rows():
 def test_rows_come_back_as_they_were(name):
     row_type = ROW_TYPES[name]
     before = rows()[name]
-    after = rows_from_table(table_from_rows(before, row_type, where=name), row_type)
+    after = rows_from_table(table_from_rows(before, row_type, where=name), row_type, where=name)
     for old, new in zip(before, after, strict=True):
         for c in columns_of(row_type):
             a, b = getattr(old, c.name), getattr(new, c.name)
@@ -75,18 +78,17 @@ def test_rows_come_back_as_they_were(name):
 
 @given(st.lists(st.integers(0, 5), max_size=4), st.randoms(use_true_random=False))
 def test_columns_of_varying_length_keep_their_rows(lengths, random):
-    base = synthetic_object(0)
     voxels = [np.full((n, 3), random.randrange(64), np.uint8) for n in lengths]
-    table = table_from_rows([dataclasses.replace(base, occupancy_64=v) for v in voxels], ObjectRow, where="t")
+    table = table_from_rows([dataclasses.replace(BALL, occupancy_64=v) for v in voxels], ObjectRow, where="t")
     table.validate(full=True)
-    for old, new in zip(voxels, rows_from_table(table, ObjectRow), strict=True):
+    for old, new in zip(voxels, rows_from_table(table, ObjectRow, where="t"), strict=True):
         np.testing.assert_array_equal(old, new.occupancy_64)
 
 
 @given(hnp.arrays(np.float64, (4, 4), elements=st.floats(-1e3, 1e3)))
 def test_transforms_are_stored_exactly(T):
-    row = dataclasses.replace(synthetic_object(0), T_objmesh_from_canonical=T)
-    (back,) = rows_from_table(table_from_rows([row], ObjectRow, where="t"), ObjectRow)
+    row = dataclasses.replace(BALL, occupancy_64=BALL.occupancy_64[:3], T_objmesh_from_canonical=T)
+    (back,) = rows_from_table(table_from_rows([row], ObjectRow, where="t"), ObjectRow, where="t")
     np.testing.assert_array_equal(back.T_objmesh_from_canonical, T)
 
 
@@ -113,6 +115,11 @@ def test_tables_hold_plain_nested_lists():
         ("clips", {"n_frames": 2**40}, "n_frames.*out of range"),
         ("clips", {"K": np.eye(4)}, "'K': wrong shape.*expected \\(3, 3\\), found \\(4, 4\\)"),
         ("clips", {"betas": np.array(["a"])}, "betas.*wrong dtype"),
+        (
+            "clips",
+            {"light_power_w": np.ones(1)},
+            "light_power_w.*number of 'light'.*expected 2, found 1",
+        ),
         ("clips", {"hand_side": b"left"}, "hand_side.*expected string, found bytes"),
     ],
 )

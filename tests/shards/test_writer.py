@@ -98,12 +98,11 @@ def test_files_are_laid_out_as_the_readme_says(dataset_dir):
 
 def test_skipped_motions_are_listed_with_their_reason(tmp_path):
     stage(tmp_path, 0)
-    stage_skipped_motion(
-        tmp_path, 0, 1, reason="no grasp in 20 attempts", timings_s={}, provenance=PROVENANCE
-    )
+    reason = "no grasp in 20 attempts"
+    stage_skipped_motion(tmp_path, 0, 1, reason=reason, timings_s={}, provenance=PROVENANCE)
     assert is_motion_staged(tmp_path, 0, 1, PROVENANCE)
     record = commit(tmp_path, 0, 1)
-    assert [(m.motion_index, m.skip_reason) for m in record.skipped] == [(1, "no grasp in 20 attempts")]
+    assert [(m.motion_index, m.skip_reason) for m in record.skipped] == [(1, reason)]
     assert record.clip_ids == ("motion-000000-camera-00",)
 
 
@@ -127,14 +126,14 @@ def test_an_object_shared_by_motions_is_stored_once(tmp_path):
 def test_two_versions_of_one_object_are_refused(tmp_path):
     stage(tmp_path, 0)
     stage(tmp_path, 1, object_row=dataclasses.replace(synthetic_object(0), author="someone"))
-    with pytest.raises(RowError, match="same object differently.*ball-0"):
+    with pytest.raises(RowError, match=r"same object differently.*ball-0"):
         commit(tmp_path, 0, 1)
     assert is_motion_staged(tmp_path, 0, 0, PROVENANCE)
 
 
 def test_a_shard_with_unfinished_motions_is_not_committed(tmp_path):
     stage(tmp_path, 0)
-    with pytest.raises(IncompleteShardError, match="2 of 3 motions are not finished.*motion 1, 2"):
+    with pytest.raises(IncompleteShardError, match=r"2 of 3 motions are not finished.*motion 1, 2"):
         commit(tmp_path, 0, 1, 2)
     assert not is_shard_committed(tmp_path, 0)
 
@@ -144,7 +143,7 @@ def test_clip_ids_must_be_unique(tmp_path):
     other = {"clip_id": "motion-000000-camera-00"}
     rename = lambda frames: [dataclasses.replace(f, **other) for f in frames]  # noqa: E731
     stage(tmp_path, 1, change_clip=other, change_frames=rename)
-    with pytest.raises(RowError, match="not unique"):
+    with pytest.raises(RowError, match=r"not unique"):
         commit(tmp_path, 0, 1)
 
 
@@ -175,7 +174,7 @@ def test_a_damaged_fragment_is_found_before_the_shard_exists(tmp_path):
     data = bytearray(fragment.read_bytes())
     data[500] ^= 1
     fragment.write_bytes(data)
-    with pytest.raises(ChecksumError, match="motion-000000/frames.parquet"):
+    with pytest.raises(ChecksumError, match=r"motion-000000/frames.parquet"):
         commit(tmp_path, 0)
     assert not is_shard_committed(tmp_path, 0)
 
@@ -184,9 +183,9 @@ def test_motions_of_another_configuration_are_not_mixed(tmp_path):
     stage(tmp_path, 0)
     begin_dataset(tmp_path, dataset_record())
     other = dataclasses.replace(PROVENANCE, config_sha256="f" * 64)
-    with pytest.raises(ShardError, match="another configuration.*delete"):
+    with pytest.raises(ShardError, match=r"another configuration.*delete"):
         is_motion_staged(tmp_path, 0, 0, other)
-    with pytest.raises(ShardError, match="another configuration.*choose another output folder"):
+    with pytest.raises(ShardError, match=r"another configuration.*choose another output folder"):
         begin_dataset(tmp_path, dataclasses.replace(dataset_record(), provenance=other))
     begin_dataset(tmp_path, dataset_record())
 

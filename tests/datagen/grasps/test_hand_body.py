@@ -115,10 +115,7 @@ def test_hulls_cover_the_skin_of_the_fingers(hand):
     rigid = hand.model.weights[:, 1:].max(1) > 0.6
     verts = hand.verts_rest[rigid]
     outside = np.min(
-        [
-            (verts @ h.face_normals.T - (h.face_normals * h.triangles[:, 0]).sum(1)).max(1)
-            for h in hulls
-        ],
+        [(verts @ h.face_normals.T - (h.face_normals * h.triangles[:, 0]).sum(1)).max(1) for h in hulls],
         axis=0,
     )
     assert outside.max() < 1e-6

@@ -153,7 +153,7 @@ def cameras_config(**changes) -> CamerasConfig:
         "min_visible_mean": 0.4,
         "min_object_size": 0.05,
         "attempts": 30,
-        "probe_frames": 3,
+        "arm_end_attempts": 4,
         "probe_rays": 48,
     }
     return CamerasConfig(**{**values, **changes})
@@ -179,7 +179,7 @@ def ball_behind_a_plate(n_frames: int = 8):
         T_world_from_obj=T,
         hand_verts_world=hand,
         hand_faces=np.array(plate.faces),
-        frames=np.array([0, 4, 7]),
+        arm_end=np.arange(0),
         rays_across=48,
     )
     around = Surroundings(

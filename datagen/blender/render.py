@@ -1,0 +1,168 @@
+"""Render every picture of a Scene, resumably, and report each one."""
+
+import hashlib
+import os
+import resource
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import bpy
+
+from datagen.blender.build import BuiltScene, build_scene, show_frame, use_camera
+from datagen.blender.devices import DeviceRequest, select_device
+from datagen.blender.log import BlenderLog, Progress, RenderError
+from datagen.blender.settings import apply_settings, sampling_seed
+from datagen.scene import Scene
+from datagen.scene_file import scene_sha256
+
+__all__ = ["Picture", "frame_path", "render_scene", "resume_key"]
+
+_KEY_FILE = "pictures.sha256"
+_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """One picture to make."""
+
+    camera: int
+    frame: int
+    path: Path
+
+
+def frame_path(frames_dir: Path, camera: int, frame: int) -> Path:
+    """Where the picture of one camera and frame is written: cam-03/frame-0007.png."""
+    return frames_dir / f"cam-{camera:02d}" / f"frame-{frame:04d}.png"
+
+
+def render_scene(
+    scene: Scene, frames_dir: Path, *, device: DeviceRequest, threads: int, progress: Progress, log: BlenderLog
+) -> None:
+    """Write all pictures that are not there yet, frames outer and cameras inner.
+
+    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop.
+    Raises DeviceError, TextureError, RenderError.
+    """
+    started = time.perf_counter()
+    key = resume_key(scene)
+    missing = _missing_pictures(scene, frames_dir, key)
+    n_pictures = len(scene.cameras) * len(scene.T_world_from_obj)
+    built = build_scene(scene)
+    used = select_device(device)
+    apply_settings(scene.render, used, threads)
+    log.check("build")
+    seconds = {"build": time.perf_counter() - started, "sync": 0.0, "render": 0.0, "write": 0.0}
+    common = {"device": used.backend, "device_names": used.names, "bpy_version": bpy.app.version_string}
+    progress.send(
+        "start", pictures=n_pictures, skipped=n_pictures - len(missing), resume_key=key, seconds=dict(seconds), **common
+    )
+    clock = _PhaseClock()
+    for picture in missing:
+        spent = _render_picture(built, picture, clock, log)
+        for phase, value in spent.items():
+            seconds[phase] += value
+        path = str(picture.path.relative_to(frames_dir))
+        progress.send("frame", camera=picture.camera, frame=picture.frame, path=path, seconds=_rounded(spent))
+    clock.close()
+    seconds["total"] = time.perf_counter() - started
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    progress.send(
+        "done",
+        rendered=len(missing),
+        skipped=n_pictures - len(missing),
+        peak_rss_mb=round(peak_mb, 1),
+        cpu_seconds=round(time.process_time(), 3),
+        seconds=_rounded(seconds),
+        **common,
+    )
+
+
+def resume_key(scene: Scene) -> str:
+    """Hash of all that decides the pictures: the scene, Blender's version and this package's source."""
+    sha = hashlib.sha256(scene_sha256(scene).encode())
+    sha.update(bpy.app.version_string.encode())
+    for source in sorted(Path(__file__).parent.glob("*.py")):
+        sha.update(source.read_bytes())
+    return sha.hexdigest()
+
+
+def _missing_pictures(scene: Scene, frames_dir: Path, key: str) -> list[Picture]:
+    """Pictures still to make; pictures of another scene are removed before the key is changed."""
+    frames_dir.mkdir(parents=True, exist_ok=True)
+    key_file = frames_dir / _KEY_FILE
+    if not key_file.is_file() or key_file.read_text() != key:
+        key_file.unlink(missing_ok=True)
+        for stale in frames_dir.glob("cam-*/frame-*.png"):
+            stale.unlink()
+        partial = key_file.with_suffix(".partial")
+        partial.write_text(key)
+        os.replace(partial, key_file)
+    pictures = [
+        Picture(camera=camera, frame=frame, path=frame_path(frames_dir, camera, frame))
+        for frame in range(len(scene.T_world_from_obj))
+        for camera in range(len(scene.cameras))
+    ]
+    return [picture for picture in pictures if not picture.path.is_file()]
+
+
+def _render_picture(built: BuiltScene, picture: Picture, clock: "_PhaseClock", log: BlenderLog) -> dict[str, float]:
+    scene, blender = built.scene, bpy.context.scene
+    started = time.perf_counter()
+    camera = scene.cameras[picture.camera]
+    show_frame(built, picture.frame)
+    use_camera(built, camera, picture.frame)
+    blender.cycles.seed = sampling_seed(scene.seed, picture.camera, picture.frame)
+    picture.path.parent.mkdir(parents=True, exist_ok=True)
+    partial = picture.path.with_name(f".{picture.path.stem}.partial.png")
+    blender.render.filepath = str(partial)
+    clock.reset()
+    try:
+        bpy.ops.render.render(write_still=True)
+    except RuntimeError as error:
+        raise RenderError(f"camera {picture.camera}, frame {picture.frame}: {error}") from error
+    finished = time.perf_counter()
+    log.check(f"camera {picture.camera}, frame {picture.frame}")
+    _check_png(partial)
+    os.replace(partial, picture.path)
+    return {
+        "sync": clock.first_sample - started,
+        "render": clock.rendered - clock.first_sample,
+        "write": finished - clock.rendered + (time.perf_counter() - finished),
+    }
+
+
+def _check_png(path: Path) -> None:
+    """A disk that filled up leaves a file that stops early."""
+    data = path.read_bytes() if path.is_file() else b""
+    if not (data.startswith(_PNG_START) and data.endswith(_PNG_END)):
+        raise RenderError(f"{path}: Blender wrote no complete picture; is the disk full?")
+
+
+class _PhaseClock:
+    """When Cycles stopped preparing and when it finished, from Blender's own messages."""
+
+    def __init__(self) -> None:
+        self.reset()
+        bpy.app.handlers.render_stats.append(self._on_stats)
+        bpy.app.handlers.render_post.append(self._on_post)
+
+    def reset(self) -> None:
+        self.first_sample = self.rendered = time.perf_counter()
+        self._waiting = True
+
+    def close(self) -> None:
+        bpy.app.handlers.render_stats.remove(self._on_stats)
+        bpy.app.handlers.render_post.remove(self._on_post)
+
+    def _on_stats(self, text: Any, _: Any = None) -> None:
+        if self._waiting and "Sample " in str(text):
+            self.first_sample, self._waiting = time.perf_counter(), False
+
+    def _on_post(self, *_: Any) -> None:
+        self.rendered = time.perf_counter()
+
+
+def _rounded(seconds: dict[str, float]) -> dict[str, float]:
+    return {phase: round(value, 4) for phase, value in seconds.items()}

@@ -1,0 +1,53 @@
+"""Cycles settings: those the Scene decides, and those chosen once by measurement (DECISIONS.md)."""
+
+import hashlib
+
+import bpy
+
+from datagen.blender.devices import Device
+from datagen.scene import RenderSettings
+
+__all__ = ["apply_settings", "sampling_seed"]
+
+
+def apply_settings(settings: RenderSettings, device: Device, threads: int) -> None:
+    """Set up Cycles and the film for 8-bit sRGB PNG files; `threads` 0 takes every core."""
+    scene = bpy.context.scene
+    render, cycles, view = scene.render, scene.cycles, scene.view_settings
+    render.engine = "CYCLES"
+    render.threads_mode, render.threads = ("FIXED", threads) if threads else ("AUTO", 1)
+    render.use_persistent_data = True  # keep textures and the BVH of whatever did not change
+
+    cycles.samples = settings.samples
+    cycles.use_adaptive_sampling = False
+    cycles.max_bounces = settings.max_bounces
+    cycles.diffuse_bounces = min(settings.max_bounces, 3)
+    cycles.glossy_bounces = min(settings.max_bounces, 3)
+    cycles.transmission_bounces = max(settings.max_bounces, 6)  # a glass has four walls
+    cycles.transparent_max_bounces = 4
+    cycles.caustics_reflective = cycles.caustics_refractive = False
+    cycles.blur_glossy = 0.5
+    cycles.sample_clamp_direct, cycles.sample_clamp_indirect = 0.0, 4.0
+    cycles.use_light_tree = False  # a few lamps and one world: sampling them in turn is as good
+    cycles.pixel_filter_type, cycles.filter_width = "BLACKMAN_HARRIS", 1.5
+
+    cycles.use_denoising = settings.denoise
+    cycles.denoiser = "OPENIMAGEDENOISE"
+    cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+    cycles.denoising_prefilter = "FAST"
+    cycles.denoising_quality = "HIGH"
+    cycles.denoising_use_gpu = device.backend != "CPU"
+
+    view.view_transform = settings.view_transform
+    view.look = "AgX - Medium High Contrast" if settings.view_transform == "AgX" else "None"
+    view.exposure = settings.exposure_ev
+    render.dither_intensity = 0.0
+    render.film_transparent = False
+    image = render.image_settings
+    image.file_format, image.color_mode, image.color_depth, image.compression = "PNG", "RGB", "8", 15
+
+
+def sampling_seed(seed: int, camera: int, frame: int) -> int:
+    """Cycles' seed of one picture, the same in whatever order pictures are rendered."""
+    digest = hashlib.sha256(f"{seed} {camera} {frame}".encode()).digest()
+    return int.from_bytes(digest[:4], "little") & 0x7FFFFFFF
