@@ -49,7 +49,11 @@ def die_with_parent() -> None:
 
 
 def run_child(
-    command: Sequence[str], *, log: Path, on_event: Callable[[dict[str, Any]], None], env: dict[str, str] | None = None
+    command: Sequence[str],
+    *,
+    log: Path,
+    on_event: Callable[[dict[str, Any]], None],
+    env: dict[str, str] | None = None,
 ) -> None:
     """Run `command`, hand every JSON line of its output to `on_event`, keep the rest in `log`.
 
@@ -76,7 +80,9 @@ def run_child(
             raise
     if status != 0:
         ended = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
-        raise ChildError(f"{_log_end(log, start)}\n(child ended {ended}; full log: {log})", status=status, log=log)
+        raise ChildError(
+            f"{_log_end(log, start)}\n(child ended {ended}; full log: {log})", status=status, log=log
+        )
 
 
 def _log_end(log: Path, start: int) -> str:

@@ -7,18 +7,25 @@ from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
 from datagen.config import load_config
+from datagen.grasps.report import summarise
+from datagen.grasps.synthesise import synthesise_grasp
+from datagen.hands.model import load_open_hand, shape_hand
+from datagen.inspection.grasp_table import grasp_table
 from datagen.inspection.plan_table import plan_table
 from datagen.inspection.sheet import contact_sheet, write_png
 from datagen.inspection.summary import shard_line, shard_summary
 from datagen.inspection.video import write_video
+from datagen.library import open_library
 from datagen.objects.errors import ObjectError
 from datagen.pipeline import PipelineError, RenderOptions, plan_dataset, render_shard
 from datagen.plan import PlanError
 from datagen.render_progress import RenderProgress
+from datagen.sampling.streams import Stream, stream_rng
 from shards.errors import ShardError
 from shards.reader import Shard, open_dataset, open_shard
 from shards.settings import SettingsError
@@ -99,10 +106,14 @@ def plan(config_path: Path, out: Path | None) -> None:
     show_default=True,
     help="What Cycles renders on. auto takes the fastest found; a named device must exist.",
 )
-@click.option("--workers", type=click.IntRange(min=1), default=1, show_default=True, help="Motions at a time.")
+@click.option(
+    "--workers", type=click.IntRange(min=1), default=1, show_default=True, help="Motions at a time."
+)
 @click.option("--threads", type=click.IntRange(min=1), default=None, help="Render threads of each worker.")
 @plain_errors
-def render(config_path: Path, out: Path | None, shard: int, device: str, workers: int, threads: int | None) -> None:
+def render(
+    config_path: Path, out: Path | None, shard: int, device: str, workers: int, threads: int | None
+) -> None:
     """Render one shard, or what is missing of it, and verify it.
 
     \b
@@ -140,8 +151,12 @@ def inspect() -> None:
 )
 @click.option("--sheet", type=click.Path(path_type=Path, dir_okay=False), help="Write a contact sheet (PNG).")
 @click.option("--clips", type=click.IntRange(min=1), default=8, show_default=True, help="Clips on the sheet.")
-@click.option("--frames", type=click.IntRange(min=1), default=6, show_default=True, help="Moments of each clip.")
-@click.option("--tile", type=click.IntRange(min=64), default=256, show_default=True, help="Tile width in pixels.")
+@click.option(
+    "--frames", type=click.IntRange(min=1), default=6, show_default=True, help="Moments of each clip."
+)
+@click.option(
+    "--tile", type=click.IntRange(min=64), default=256, show_default=True, help="Tile width in pixels."
+)
 @click.option("--video", type=click.Path(path_type=Path, dir_okay=False), help="Write one clip as MP4.")
 @click.option("--clip", "clip_id", default=None, help="Clip of the video.  [default: the first]")
 @plain_errors
@@ -195,6 +210,40 @@ def verify(path: Path) -> None:
     sys.exit(1 if bad else 0)
 
 
+@main.command()
+@config_option
+@click.option(
+    "--object", "objects", multiple=True, help="Only this object (may be repeated).  [default: all]"
+)
+@click.option(
+    "--motions", type=click.IntRange(min=1), default=1, show_default=True, help="Motions per object."
+)
+@plain_errors
+def grasps(config_path: Path, objects: tuple[str, ...], motions: int) -> None:
+    """Simulate grasps without rendering; print success and quality per object.
+
+    \b
+    Example:
+      datagen grasps --object starter/milk --motions 3
+    """
+    config = load_config(config_path)
+    library = open_library(config.objects)
+    uids = objects or tuple(uid for uid in library.uids() if uid not in config.objects.exclude)
+    hand = shape_hand(load_open_hand(), np.zeros(config.sampling.appearance.n_betas))
+    console = Console(stderr=True)
+    reports = []
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task("", total=len(uids) * motions)
+        for number, uid in enumerate(uids):
+            asset = library.load(uid)
+            for motion in range(motions):
+                bar.update(task, description=uid)
+                rng = stream_rng(config.seed, number, Stream.GRASP, 1 + motion)
+                reports.append(synthesise_grasp(hand, asset, config.grasp, rng))
+                bar.advance(task)
+    Console().print(grasp_table(summarise(reports)))
+
+
 def default_out(config_path: Path) -> Path:
     """Where the Makefile puts it too."""
     return Path("data") / config_path.stem
@@ -216,5 +265,7 @@ def _verified(path: Path) -> Iterator[ShardReport]:
         with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
             task = bar.add_task(f"verifying shard {shard.record.shard}", total=None)
             yield verify_shard(
-                shard, split_rule=rule, progress=lambda done, total: bar.update(task, completed=done, total=total)
+                shard,
+                split_rule=rule,
+                progress=lambda done, total: bar.update(task, completed=done, total=total),
             )

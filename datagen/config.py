@@ -43,7 +43,9 @@ def load_config(path: Path) -> DatasetConfig:
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
-        raise SettingsError(f"{path}: no such configuration; configs/datagen holds tiny, small and paper") from error
+        raise SettingsError(
+            f"{path}: no such configuration; configs/datagen holds tiny, small and paper"
+        ) from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):

@@ -28,7 +28,6 @@ from shards.writer import begin_dataset, commit_shard, is_motion_staged, is_shar
 __all__ = ["PipelineError", "Progress", "RenderOptions", "plan_dataset", "provenance_of", "render_shard"]
 
 
-
 class PipelineError(RuntimeError):
     """A shard could not be finished; what is staged stays and is used by the next run."""
 
@@ -136,7 +135,9 @@ def _run_workers(
         log = out / "staging" / f"shard-{shard:05d}" / f"motion-{motion_index:06d}.log"
         try:
             # BLAS threads would only fight with Cycles, and one thread sums in one order everywhere.
-            run_child(command, log=log, on_event=on_event, env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
+            run_child(
+                command, log=log, on_event=on_event, env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+            )
         except ChildError as error:
             return error
         return None
@@ -158,5 +159,7 @@ def _lock(path: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise PipelineError(f"{path}: another process is rendering this shard; wait for it or stop it") from error
+            raise PipelineError(
+                f"{path}: another process is rendering this shard; wait for it or stop it"
+            ) from error
         yield

@@ -17,7 +17,16 @@ import pyarrow.parquet as pq
 
 from shards.splits import SplitRule, split_of_object
 
-__all__ = ["PLAN_FILE", "MotionPlan", "Plan", "PlanConfig", "PlanError", "make_plan", "read_plan", "write_plan"]
+__all__ = [
+    "PLAN_FILE",
+    "MotionPlan",
+    "Plan",
+    "PlanConfig",
+    "PlanError",
+    "make_plan",
+    "read_plan",
+    "write_plan",
+]
 
 PLAN_FILE = "plan.parquet"
 PLAN_STREAM = 0x504C414E  # the plan's own stream of the dataset seed
@@ -87,7 +96,9 @@ def make_plan(
 ) -> Plan:
     """Deal the objects out in shuffled rounds: every object once before any object twice."""
     if not object_uids:
-        raise PlanError("the object library is empty: expected at least one object; check objects.* in the config")
+        raise PlanError(
+            "the object library is empty: expected at least one object; check objects.* in the config"
+        )
     rng = np.random.default_rng(np.random.SeedSequence([dataset_seed, PLAN_STREAM]))
     uids = sorted(object_uids)
     rounds = -(-config.motions // len(uids))
@@ -123,12 +134,16 @@ def write_plan(plan: Plan, path: Path) -> None:
 def read_plan(path: Path) -> Plan:
     """The plan that `write_plan` wrote; PlanError when there is none or it is damaged."""
     if not path.is_file():
-        raise PlanError(f"{path}: no plan here; make one with: datagen plan --config CONFIG --out {path.parent}")
+        raise PlanError(
+            f"{path}: no plan here; make one with: datagen plan --config CONFIG --out {path.parent}"
+        )
     try:
         table = pq.read_table(path, page_checksum_verification=True)
         motions = tuple(MotionPlan(**row) for row in table.to_pylist())
     except (pa.ArrowException, OSError, TypeError) as error:
-        raise PlanError(f"{path}: not a readable plan ({error}); delete it and run datagen plan again") from error
+        raise PlanError(
+            f"{path}: not a readable plan ({error}); delete it and run datagen plan again"
+        ) from error
     return Plan(motions=motions)
 
 

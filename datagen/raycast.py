@@ -4,6 +4,7 @@ Embree finds the triangle in float32; the depth is then computed again in float6
 triangle's plane. Rays are scaled to z = 1 in the camera, so the ray parameter is the depth.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ __all__ = ["Hits", "PixelWindow", "TriangleCaster", "cast_window", "pixel_rays",
 # Plane and Embree agree to ~1e-6 of the distance; where they differ by more the ray grazes the
 # triangle's border edge-on, and the plane's value would lie outside the triangle.
 MAX_RELATIVE_DISAGREEMENT = 1e-4
+BATCH = 4096  # rays: temporaries stay in the cache, and below the size that the allocator maps anew
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,6 +41,11 @@ class PixelWindow:
         """Indexes an image (height, width, ...)."""
         return slice(self.y0, self.y1), slice(self.x0, self.x1)
 
+    def bands(self, rows: int) -> Iterator["PixelWindow"]:
+        """The window cut into strips of at most `rows` rows, from the top."""
+        for y0 in range(self.y0, self.y1, rows):
+            yield PixelWindow(x0=self.x0, y0=y0, x1=self.x1, y1=min(y0 + rows, self.y1))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Hits:
@@ -54,25 +61,25 @@ class TriangleCaster:
     def __init__(self, verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"]) -> None:
         self.verts = verts
         corners = verts[faces]
-        self.first_corner = corners[:, 0]
         self.normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        self._offsets = np.einsum("fi,fi->f", self.normals, corners[:, 0])
         self._scene = EmbreeScene(robust=True)  # watertight along shared edges
         self._mesh = TriangleMesh(self._scene, verts.astype(np.float32), faces.astype(np.int32))
 
     def cast(self, T_mesh_from_cam: Float[np.ndarray, "4 4"], rays_cam: Float[np.ndarray, "ray 3"]) -> Hits:
         """Depth and triangle of the first hit from the camera centre. `rays_cam` have z = 1."""
-        if len(rays_cam) == 0:
-            return Hits(depth=np.zeros(0), triangle=np.zeros(0, np.int32))
-        center = T_mesh_from_cam[:3, 3]
-        rays = rays_cam @ T_mesh_from_cam[:3, :3].T
-        origins = np.broadcast_to(center.astype(np.float32), rays.shape)
-        found = self._scene.run(np.ascontiguousarray(origins), rays.astype(np.float32), output=True)
-        triangle = found["primID"]
-        hit = np.flatnonzero(triangle >= 0)
-        depth = np.full(len(rays), np.inf)
-        depth[hit] = self._plane_depth(
-            center, rays[hit], triangle[hit], found["tfar"][hit].astype(np.float64)
-        )
+        depth = np.full(len(rays_cam), np.inf)
+        triangle = np.full(len(rays_cam), -1, np.int32)
+        origins = np.tile(T_mesh_from_cam[:3, 3].astype(np.float32), (min(BATCH, len(rays_cam)), 1))
+        for start in range(0, len(rays_cam), BATCH):
+            batch = slice(start, start + BATCH)
+            rays = rays_cam[batch] @ T_mesh_from_cam[:3, :3].T
+            found = self._scene.run(origins[: len(rays)], rays.astype(np.float32), output=True)
+            triangle[batch] = found["primID"]
+            hit = np.flatnonzero(found["primID"] >= 0)
+            depth[start + hit] = self._plane_depth(
+                T_mesh_from_cam[:3, 3], rays[hit], found["primID"][hit], found["tfar"][hit].astype(np.float64)
+            )
         return Hits(depth=depth, triangle=triangle)
 
     def _plane_depth(
@@ -83,7 +90,7 @@ class TriangleCaster:
         embree_depth: Float[np.ndarray, "hit"],
     ) -> Float[np.ndarray, "hit"]:
         normal = self.normals[triangle]
-        height = np.einsum("hi,hi->h", normal, self.first_corner[triangle] - center)
+        height = self._offsets[triangle] - normal @ center
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = height / np.einsum("hi,hi->h", normal, rays)
             agree = np.abs(depth - embree_depth) <= MAX_RELATIVE_DISAGREEMENT * embree_depth

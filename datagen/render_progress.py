@@ -4,7 +4,15 @@ from collections.abc import Sequence
 from types import TracebackType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    Task,
+    TextColumn,
+    TimeRemainingColumn,
+)
 from rich.text import Text
 
 from datagen.pipeline import Progress as Step
@@ -62,7 +70,11 @@ class RenderProgress:
         motion = self._motions[step.motion_index]
         if step.phase in ("staged", "done", "skipped"):
             self._advance_to(step.motion_index, self._n_frames(step.motion_index))
-            text = {"staged": "was finished before", "done": "done", "skipped": "skipped, reason in shard.json"}
+            text = {
+                "staged": "was finished before",
+                "done": "done",
+                "skipped": "skipped, reason in shard.json",
+            }
             self._bar.console.print(f"motion {step.motion_index} ({motion.object_uid}): {text[step.phase]}")
             return
         if step.phase == "render":

@@ -95,7 +95,9 @@ def run_job(job: Job) -> None:
         sampled = _sampled_motion(job, asset, timer)
     except (NoGraspError, SamplingError) as error:
         provenance, seconds = job.provenance, timer.seconds
-        stage_skipped_motion(job.out, shard, index, reason=str(error), timings_s=seconds, provenance=provenance)
+        stage_skipped_motion(
+            job.out, shard, index, reason=str(error), timings_s=seconds, provenance=provenance
+        )
         emit(phase="skipped", done=1, total=1)
         return
     record = _rendered(job, sampled, timer)
@@ -159,7 +161,14 @@ def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderReco
         elif event["event"] == "done":
             summary.update(event)
 
-    command = [sys.executable, str(RENDER_SCRIPT), "--scene", str(scene_path), "--frames-dir", str(job.work_dir)]
+    command = [
+        sys.executable,
+        str(RENDER_SCRIPT),
+        "--scene",
+        str(scene_path),
+        "--frames-dir",
+        str(job.work_dir),
+    ]
     command += ["--device", job.device, "--threads", str(job.threads)]
     with timer.phase("blender"):
         run_child(command, log=job.work_dir / "blender.log", on_event=on_event)
@@ -189,7 +198,9 @@ def _rows(
                 png = job.work_dir / f"cam-{camera:02d}" / f"frame-{frame:04d}.png"
                 rgb = encoded_rgb(png.read_bytes(), job.config.shard)
                 rows[camera].append(
-                    frame_row(job.motion, sampled, camera, frame, buffers, distances_m[frame], rgb, job.config.shard)
+                    frame_row(
+                        job.motion, sampled, camera, frame, buffers, distances_m[frame], rgb, job.config.shard
+                    )
                 )
         emit(phase="annotate", done=(frame + 1) * n_cameras, total=n_frames * n_cameras)
     clips = [

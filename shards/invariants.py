@@ -108,16 +108,35 @@ def _voxel_problems(row: ObjectRow) -> Iterator[str]:
     near = _dilated(grid)
     if np.mean(near[_voxel_of(row.surface_points)]) < SAMPLE_SHARE:
         yield "occupancy_64 does not cover the surface points"
-    deep, far = row.sdf_values < -2 * VOXEL, row.sdf_values > 2 * VOXEL
-    inside_box = np.all(np.abs(row.sdf_points) <= 0.5, axis=1)
-    for name, chosen, expected in (("inside", deep, True), ("outside", far & inside_box, False)):
-        if np.any(chosen) and np.mean(grid[_voxel_of(row.sdf_points[chosen])] == expected) < SAMPLE_SHARE:
+    outside = _reached_from_the_border(grid)
+    enclosed = ~outside & ~grid
+    in_cube = np.all(np.abs(row.sdf_points) <= 0.5, axis=1)
+    deep, far = in_cube & (row.sdf_values < -2 * VOXEL), in_cube & (row.sdf_values > 2 * VOXEL)
+    for name, chosen, expected in (("inside", deep, enclosed), ("outside", far, outside)):
+        if np.any(chosen) and np.mean(expected[_voxel_of(row.sdf_points[chosen])]) < SAMPLE_SHARE:
             yield f"occupancy_64 and sdf_values disagree {name}"
 
 
 def _voxel_of(points_canonical: Float[np.ndarray, "point 3"]) -> tuple[np.ndarray, ...]:
     """Index of each point into the grid with a border of one."""
     return tuple(np.clip(np.floor((points_canonical + 0.5) / VOXEL), 0, 63).astype(np.int64).T + 1)
+
+
+def _reached_from_the_border(grid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:
+    """Free voxels that a path of face neighbours joins to the border of the grid."""
+    free = ~grid
+    reached = np.zeros_like(grid)
+    reached[0] = True  # the border of one is free everywhere
+    before = 0
+    while (now := int(np.count_nonzero(reached))) != before:
+        before = now
+        for axis in range(3):
+            forward, back = np.moveaxis(reached, axis, 0), np.moveaxis(free, axis, 0)
+            for i in range(1, len(forward)):
+                forward[i] |= forward[i - 1] & back[i]
+            for i in range(len(forward) - 2, -1, -1):
+                forward[i] |= forward[i + 1] & back[i]
+    return reached
 
 
 def _dilated(grid: Bool[np.ndarray, "x y z"]) -> Bool[np.ndarray, "x y z"]:

@@ -86,7 +86,7 @@ class ObjectRow:
         3,
         unit="voxel",
         frame="canonical",
-        meaning="(i, j, k) of occupied voxels along (x, y, z), 0..63, sorted, unique; "
+        meaning="(i, j, k) along (x, y, z) of the voxels that the surface passes through, 0..63, sorted, unique; "
         "voxel i spans [i/64 - 0.5, (i+1)/64 - 0.5].",
     )
     surface_points: Float[np.ndarray, "surface 3"] = column(

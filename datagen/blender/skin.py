@@ -26,10 +26,10 @@ _CREASE_M = 0.0009  # per unit of texture brightness: painted creases become rel
 _WRINKLE_M = 0.00035
 _PORE_M = 0.00012
 
-_ARM_DRYER = 0.10  # added roughness: the hand's texture carries relief, the forearm is plain
+_ARM_DRYER = 0.14  # added roughness: the hand's texture carries relief, the forearm is plain
 _THREAD_M = 0.0012
-_WRIST_BLUR_M = 0.012
-_TEXTURE_FADES_M, _TEXTURE_FADES_TO = 0.035, 0.8
+_BORDER_M = 0.007  # of hand on the wrist's border that takes the forearm's colour
+_TONE_BLUR_M = 0.012
 
 
 def skin_material(look: HandLook) -> bpy.types.Material:
@@ -60,6 +60,7 @@ def skin_material(look: HandLook) -> bpy.types.Material:
             "Base Color": color,
             "Roughness": roughness,
             "IOR": _SKIN_IOR,
+            "Specular IOR Level": 0.42,
             "Normal": graph.bump(height, look.bump),
             "Subsurface Weight": look.subsurface,
             "Subsurface Radius": _SCATTER_RGB,
@@ -116,29 +117,37 @@ def sleeve_material(look: HandLook, axis: Float[np.ndarray, "3"]) -> bpy.types.M
 
 
 def arm_color_and_blend(
-    surface_: HandSurface, verts: Float[np.ndarray, "vert 3"], look: HandLook
+    topology: HandSurface, verts: Float[np.ndarray, "vert 3"], look: HandLook
 ) -> tuple[Float[np.ndarray, "vert 3"], Float[np.ndarray, "vert"]]:
-    """Colour that continues the texture of the wrist along the forearm, and where it applies.
+    """Colour that continues the skin of the wrist along the forearm, and where it applies.
 
-    The colour of a forearm vertex is that of the hand vertices nearest to it, so palm side and
-    back keep their tones. It takes over from the texture, which repeats along the arm, within a
-    few centimetres of the wrist.
+    A forearm vertex takes the colour of the nearest hand vertices that lie clear of the wrist's
+    border (textures are often pale there), so palm side and back keep their tones. The border
+    itself is crossed smoothly on the hand's side. `verts` are those of the first frame.
     """
-    hand_faces = surface_.faces[surface_.face_part == HAND_SKIN]
-    hand_uv = surface_.corner_uv[surface_.face_part == HAND_SKIN]
-    hand, first = np.unique(hand_faces.reshape(-1), return_index=True)
-    hand_color = _sample(look.skin_png, hand_uv.reshape(-1, 2)[first])
-    arm = np.unique(surface_.faces[surface_.face_part == ARM_SKIN])
+    hand_corners = topology.faces[topology.face_part == HAND_SKIN].reshape(-1)
+    hand, first = np.unique(hand_corners, return_index=True)
+    hand_uv = topology.corner_uv[topology.face_part == HAND_SKIN].reshape(-1, 2)[first]
+    arm = np.unique(topology.faces[topology.face_part == ARM_SKIN])
+    color, blend = np.zeros((len(verts), 3)), np.zeros(len(verts))
+    border = np.intersect1d(hand, arm)
+    if not len(border):
+        return color, blend
 
-    blend = np.zeros(len(verts))
-    color = np.zeros((len(verts), 3))
-    if len(arm):
-        distance = np.linalg.norm(verts[arm][:, None] - verts[hand][None], axis=-1)
-        farther = distance - distance.min(axis=1, keepdims=True)
-        weight = np.exp(-0.5 * (farther / _WRIST_BLUR_M) ** 2)
-        color[arm] = weight @ hand_color / weight.sum(axis=1, keepdims=True)
-        blend[arm] = _TEXTURE_FADES_TO * np.clip(distance.min(axis=1) / _TEXTURE_FADES_M, 0.0, 1.0)
+    to_border = _distances(verts[hand], verts[border]).min(axis=1)
+    blend[hand] = np.clip(1.0 - (to_border - _BORDER_M) / _BORDER_M, 0.0, 1.0)
+    blend[arm] = 1.0
+    colored = np.flatnonzero(blend)
+    clear = to_border > 2.0 * _BORDER_M
+    distance = _distances(verts[colored], verts[hand[clear]])
+    farther = distance - distance.min(axis=1, keepdims=True)
+    weight = np.exp(-0.5 * (farther / _TONE_BLUR_M) ** 2)
+    color[colored] = weight @ _sample(look.skin_png, hand_uv[clear]) / weight.sum(axis=1, keepdims=True)
     return color, blend
+
+
+def _distances(a: Float[np.ndarray, "m 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "m n"]:
+    return np.linalg.norm(a[:, None] - b[None], axis=-1)
 
 
 def _sample(png: bytes, uv: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:

@@ -142,7 +142,7 @@ def _arm_axis(shaped: ShapedHand, hand_faces: Int[np.ndarray, "hand_face 3"]) ->
     local = (shaped.verts_rest - origin) @ np.stack([side, back, axis], axis=1)
     across, radius = local[loop, :2], np.linalg.norm(local[:, :2], axis=1)
     profile = np.stack([radius, local[:, 2]], axis=1)
-    step = profile[loop] - [_mean_neighbour(vert, loop, hand_faces, profile) for vert in loop]
+    step = profile[loop] - [_mean_neighbour(vert, loop, hand_faces, profile) for vert in loop.tolist()]
     flare = np.clip(step[:, 0] / np.maximum(step[:, 1], 1e-3), -_MAX_FLARE, _MAX_FLARE)
     return _ArmAxis(
         origin=origin,

@@ -11,7 +11,20 @@ __all__ = ["draw_labels"]
 
 # RGB. Amodal contours are thin and pale, visible ones full; axes are x red, y green, z blue.
 OBJECT_COLOR, HAND_COLOR, ARM_COLOR = (255, 190, 40), (60, 200, 255), (150, 150, 160)
-BONES = [(0, 1), (1, 2), (2, 3), (3, 17), (0, 4), (4, 5), (5, 6), (6, 18), (0, 10), (10, 11), (11, 12), (12, 19)]
+BONES = [
+    (0, 1),
+    (1, 2),
+    (2, 3),
+    (3, 17),
+    (0, 4),
+    (4, 5),
+    (5, 6),
+    (6, 18),
+    (0, 10),
+    (10, 11),
+    (11, 12),
+    (12, 19),
+]
 BONES += [(0, 7), (7, 8), (8, 9), (9, 20), (0, 13), (13, 14), (14, 15), (15, 16)]
 DIGIT_COLORS = ((90, 220, 90), (220, 220, 80), (250, 150, 70), (230, 90, 200), (240, 70, 70))
 
@@ -46,7 +59,9 @@ def draw_labels(
 
 
 def _draw_joints(canvas: UInt8[np.ndarray, "height width 3"], joints_px: Float[np.ndarray, "21 2"]) -> None:
-    points = [None if np.isnan(p).any() else (round(p[0] - 0.5), round(p[1] - 0.5)) for p in joints_px.tolist()]
+    points = [
+        None if np.isnan(p).any() else (round(p[0] - 0.5), round(p[1] - 0.5)) for p in joints_px.tolist()
+    ]
     for number, (a, b) in enumerate(BONES):
         if points[a] is not None and points[b] is not None:
             cv2.line(canvas, points[a], points[b], DIGIT_COLORS[number // 4], 1, cv2.LINE_AA)
@@ -65,7 +80,9 @@ def _draw_axes(
         return
     origin = (round(ends[0, 0]), round(ends[0, 1]))
     for axis, color in enumerate(((235, 40, 40), (40, 200, 60), (60, 90, 255))):
-        cv2.arrowedLine(canvas, origin, (round(ends[1 + axis, 0]), round(ends[1 + axis, 1])), color, 2, cv2.LINE_AA)
+        cv2.arrowedLine(
+            canvas, origin, (round(ends[1 + axis, 0]), round(ends[1 + axis, 1])), color, 2, cv2.LINE_AA
+        )
 
 
 def _pale(color: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -21,8 +21,18 @@ def contact_sheet(
 ) -> UInt8[np.ndarray, "height width 3"]:
     """`n_clips` clips spread over the shard, `n_frames` moments of each: plain above, labelled below."""
     clips = shard.clips()
-    chosen = [clips[i] for i in np.unique(np.linspace(0, len(clips) - 1, min(n_clips, len(clips))).round().astype(int))]
-    scale_m = dict(zip(*(shard.read_objects(["object_uid", "object_scale_m"])[c] for c in ("object_uid", "object_scale_m"))))
+    chosen = [
+        clips[i]
+        for i in np.unique(np.linspace(0, len(clips) - 1, min(n_clips, len(clips))).round().astype(int))
+    ]
+    scale_m = dict(
+        zip(
+            *(
+                shard.read_objects(["object_uid", "object_scale_m"])[c]
+                for c in ("object_uid", "object_scale_m")
+            )
+        )
+    )
     rows = [_clip_rows(shard, clip, float(scale_m[clip.object_uid]), n_frames, tile_px) for clip in chosen]
     return np.concatenate(rows, axis=0)
 
@@ -58,7 +68,9 @@ def _clip_rows(
     moments = np.linspace(0, clip.n_frames - 1, n_frames).round().astype(int)
     zoom = max(1, round(2 * tile_px / clip.image_width))
     plain = [_tile(frames.rgb(i), tile_px) for i in moments]
-    labelled = [_tile(labelled_frame(clip, frames, i, 0.5 * object_scale_m, zoom=zoom), tile_px) for i in moments]
+    labelled = [
+        _tile(labelled_frame(clip, frames, i, 0.5 * object_scale_m, zoom=zoom), tile_px) for i in moments
+    ]
     picture = np.concatenate([np.concatenate(plain, axis=1), np.concatenate(labelled, axis=1)], axis=0)
     caption = np.full((CAPTION_PX, picture.shape[1], 3), 32, np.uint8)
     text = (

@@ -20,7 +20,29 @@ CLIP_COLUMNS = (
     "min_margin_px", "max_penetration_m", "digits_in_contact", "slip_lift_m", "slip_manipulation_m",
     "grasp_attempts", "hdri", "table_material", "render_device", "render_samples", "render_seconds",
 )  # fmt: skip
-OBJECT_COLUMNS = ("object_uid", "name", "licence", "author", "object_scale_m", "texture_resolution_px", "color_detail")
+OBJECT_COLUMNS = (
+    "object_uid",
+    "licence",
+    "author",
+    "object_scale_m",
+    "texture_resolution_px",
+    "color_detail",
+)
+
+TEXT_COLUMNS = (
+    "",
+    "value",
+    "clip",
+    "camera",
+    "object",
+    "licence",
+    "author",
+    "light",
+    "table",
+    "file",
+    "phase",
+    "reason",
+)
 
 
 def shard_line(record: ShardRecord, out: Path) -> str:
@@ -36,7 +58,8 @@ def shard_summary(shard: Shard) -> Group:
     """Everything a person wants to know before using a shard, as rich tables."""
     clips = shard.read_clips(CLIP_COLUMNS)
     objects = shard.read_objects(OBJECT_COLUMNS)
-    parts = [_overview(shard, clips), _objects(objects, clips), _clips(clips), _files(shard), _timings(shard)]
+    parts = [_overview(shard, clips), _objects(objects, clips), _motions(clips), _clips(clips)]
+    parts += [_files(shard), _timings(shard)]
     if shard.record.skipped:
         parts.append(_skipped(shard))
     return Group(*parts)
@@ -45,7 +68,7 @@ def shard_summary(shard: Shard) -> Group:
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left")
     for column in columns:
-        table.add_column(column, justify="left" if column in ("", "clip", "object", "file", "phase") else "right")
+        table.add_column(column, justify="left" if column in TEXT_COLUMNS else "right")
     return table
 
 
@@ -70,12 +93,11 @@ def _overview(shard: Shard, clips: Columns) -> Table:
 
 
 def _objects(objects: Columns, clips: Columns) -> Table:
-    table = _table("objects", "object", "name", "licence", "author", "longest side", "texture", "detail", "clips")
+    table = _table("objects", "object", "licence", "author", "longest", "texture", "detail", "clips")
     count = Counter(clips["object_uid"])
     for i, uid in enumerate(objects["object_uid"]):
         table.add_row(
             uid,
-            objects["name"][i],
             objects["licence"][i],
             objects["author"][i],
             f"{100 * objects['object_scale_m'][i]:.1f} cm",
@@ -86,28 +108,42 @@ def _objects(objects: Columns, clips: Columns) -> Table:
     return table
 
 
-def _clips(clips: Columns) -> Table:
+def _motions(clips: Columns) -> Table:
+    """Grasp and setting of each motion; its clips share them."""
     table = _table(
-        "clips", "clip", "object", "camera", "visible mean/min", "drift", "margin", "grasp: depth", "digits",
-        "slip lift/turn", "tries", "light", "table", "s/frame",
-    )  # fmt: skip
+        "motions", "motion", "object", "grasp depth", "digits", "slip lift/turn", "tries", "light", "table"
+    )
+    for i in _first_clips(clips):
+        table.add_row(
+            str(clips["motion_index"][i]),
+            clips["object_uid"][i],
+            f"{1000 * clips['max_penetration_m'][i]:.1f} mm",
+            str(clips["digits_in_contact"][i]),
+            f"{1000 * clips['slip_lift_m'][i]:.0f}/{1000 * clips['slip_manipulation_m'][i]:.0f} mm",
+            str(clips["grasp_attempts"][i]),
+            clips["hdri"][i],
+            clips["table_material"][i] or "none",
+        )
+    return table
+
+
+def _clips(clips: Columns) -> Table:
+    table = _table("clips", "clip", "camera", "fps", "visible mean/min", "drift", "margin", "s/frame")
     for i, clip_id in enumerate(clips["clip_id"]):
         table.add_row(
             clip_id,
-            clips["object_uid"][i],
             clips["camera_kind"][i],
-            f"{clips['object_visible_fraction_mean'][i]:.2f} / {clips['object_visible_fraction_min'][i]:.2f}",
+            f"{clips['fps'][i]:g}",
+            f"{clips['object_visible_fraction_mean'][i]:.2f}/{clips['object_visible_fraction_min'][i]:.2f}",
             f"{clips['object_drift_px'][i]:.0f} px",
             f"{clips['min_margin_px'][i]:.0f} px",
-            f"{1000 * clips['max_penetration_m'][i]:.1f} mm",
-            f"{clips['digits_in_contact'][i]}",
-            f"{1000 * clips['slip_lift_m'][i]:.0f} / {1000 * clips['slip_manipulation_m'][i]:.0f} mm",
-            f"{clips['grasp_attempts'][i]}",
-            clips["hdri"][i],
-            clips["table_material"][i] or "none",
             f"{clips['render_seconds'][i] / clips['n_frames'][i]:.2f}",
         )
     return table
+
+
+def _first_clips(clips: Columns) -> list[int]:
+    return [int(i) for i in np.unique(clips["motion_index"], return_index=True)[1]]
 
 
 def _files(shard: Shard) -> Table:

@@ -22,7 +22,9 @@ def write_video(shard: Shard, clip_id: str, path: Path, *, repeats: int) -> None
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), clip.fps, size)
     if not writer.isOpened():
-        raise StorageError("cannot be written as MP4", where=str(path), fix="name a writable file ending in .mp4")
+        raise StorageError(
+            "cannot be written as MP4", where=str(path), fix="name a writable file ending in .mp4"
+        )
     try:
         for index in [*range(clip.n_frames)] * repeats:
             picture = np.concatenate([frames.rgb(index), labelled_frame(clip, frames, index, axis_m)], axis=1)

@@ -89,6 +89,7 @@ def material_from_mtl(entry: MtlEntry, images: dict[str, bytes]) -> Material:
     is_glass = transmission > 0 and any(word in name for word in GLASS_WORDS)
     roughness = entry.roughness if entry.roughness is not None else _roughness(entry, specular)
     if transmission:
+        metallic = 0.0
         roughness = 0.02 if is_glass else min(roughness, 0.15)
     elif metallic > 0.5 and entry.roughness is None:
         roughness = min(roughness, 0.35)

@@ -26,7 +26,9 @@ pytestmark = pytest.mark.blender
 VARYING = {"render_seconds", "rgb"}
 
 
-def small_config(folder: Path, *, motions: int = 2, cameras: int = 2, frames: int = 2, size: int = 48) -> Path:
+def small_config(
+    folder: Path, *, motions: int = 2, cameras: int = 2, frames: int = 2, size: int = 48
+) -> Path:
     """tiny.yaml on a folder of two plain objects, with few and small pictures."""
     meshes = folder / "meshes"
     meshes.mkdir(parents=True)
@@ -107,7 +109,17 @@ def test_two_workers_give_the_same_data(config, reference, tmp_path):
 
 
 def test_a_missing_gpu_is_one_line_and_exit_status_2(config, tmp_path):
-    arguments = ["render", "--config", str(config), "--out", str(tmp_path), "--shard", "0", "--device", "optix"]
+    arguments = [
+        "render",
+        "--config",
+        str(config),
+        "--out",
+        str(tmp_path),
+        "--shard",
+        "0",
+        "--device",
+        "optix",
+    ]
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
     assert "optix" in result.output.lower()

@@ -45,15 +45,27 @@ def make_shard(root: Path) -> None:
     for index in range(N_MOTIONS):
         if (root / "shards/shard-00000/shard.json").exists() or is_motion_staged(root, 0, index, PROVENANCE):
             continue
-        with (root.parent / f"{root.name}.log").open("a") as log:
-            log.write(f"{index}\n")
+        write_log(root, f"make {index}")
         keys = {"timings_s": {"render": 1.0}, "provenance": PROVENANCE}
         if index == N_MOTIONS - 1:
             stage_skipped_motion(root, 0, index, reason="no grasp was found", **keys)
         else:
             object_row, clips, frames = ROWS[index]
             stage_motion(root, 0, index, object_row=object_row, clips=clips, frames=frames, **keys)
+        write_log(root, f"done {index}")
     commit_shard(root, 0, motion_indices=range(N_MOTIONS), provenance=PROVENANCE)
+
+
+def write_log(root: Path, line: str) -> None:
+    with (root.parent / f"{root.name}.log").open("a") as log:
+        log.write(line + "\n")
+
+
+def logged(root: Path, what: str) -> set[int]:
+    """Motions that were begun ("make") or finished ("done")."""
+    path = root.parent / f"{root.name}.log"
+    lines = [line.split() for line in path.read_text().splitlines()] if path.exists() else []
+    return {int(index) for kind, index in lines if kind == what}
 
 
 def die_before_event(number: int, root: Path) -> None:
@@ -96,7 +108,6 @@ def tree_hashes(root: Path) -> dict[str, str]:
 
 def attempt(root: Path, number: int, reference: dict[str, str]) -> tuple[bool, list[str]]:
     """(was killed, problems) of one kill and one resume."""
-    log = root.parent / f"{root.name}.log"
 
     def killed() -> None:
         die_before_event(number, root)
@@ -112,11 +123,11 @@ def attempt(root: Path, number: int, reference: dict[str, str]) -> tuple[bool, l
         problems += [str(finding) for finding in verify_shard(shard, split_rule=SPLIT_RULE).findings]
     elif (root / "dataset.json").exists() and open_dataset(root).shards:
         problems.append("an unfinished shard can be opened")
-    finished = set(range(N_MOTIONS)) if committed else staged_motions(root)
-    log.write_text("")
+    finished = logged(root, "done") | staged_motions(root)
+    (root.parent / f"{root.name}.log").write_text("")
     if in_fork(lambda: make_shard(root)) != 0:
         problems.append("the resumed run failed")
-    redone = finished & {int(line) for line in log.read_text().split()}
+    redone = finished & logged(root, "make")
     if redone:
         problems.append(f"motions {sorted(redone)} were made again")
     if tree_hashes(root) != reference:

@@ -76,7 +76,9 @@ def synthetic_object(number: int, *, mesh: bool = True) -> ObjectRow:
     normals = rng.normal(size=(400, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     centers = (np.stack(np.meshgrid(*[np.arange(64)] * 3, indexing="ij"), -1).reshape(-1, 3) + 0.5) / 64 - 0.5
-    occupied = np.linalg.norm(centers, axis=1) <= 0.5
+    occupied = (
+        np.abs(np.linalg.norm(centers, axis=1) - 0.5) <= np.sqrt(3.0) / 128
+    )  # all voxels the sphere cuts
     voxels = np.floor((centers[occupied] + 0.5) * 64).astype(np.uint8)
     samples = rng.uniform(-0.5, 0.5, (300, 3))
     T = np.diag([2 * RADIUS_M] * 3 + [1.0])
