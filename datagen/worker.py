@@ -35,7 +35,7 @@ from shards.records import Provenance
 from shards.schema import ClipRow, FrameRow
 from shards.writer import motion_dir, stage_motion, stage_skipped_motion
 
-__all__ = ["main"]
+__all__ = ["RENDER_SCRIPT", "Job", "main", "run_job", "sampled_motion"]
 
 RENDER_SCRIPT = Path(__file__).resolve().parent.parent / "blender_scripts" / "render_scene.py"
 
@@ -92,7 +92,7 @@ def run_job(job: Job) -> None:
     with timer.phase("object"):
         asset = open_library(job.config.objects).load(job.motion.object_uid)
     try:
-        sampled = _sampled_motion(job, asset, timer)
+        sampled = sampled_motion(job, asset, timer)
     except (NoGraspError, SamplingError) as error:
         provenance, seconds = job.provenance, timer.seconds
         stage_skipped_motion(
@@ -118,7 +118,7 @@ def run_job(job: Job) -> None:
     emit(phase="done", done=1, total=1)
 
 
-def _sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledMotion:
+def sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledMotion:
     """Draw hand shape, grasp and scene, each from its own stream of this motion's seed."""
     seed, index = job.config.seed, job.motion.motion_index
     with timer.phase("grasp"):

@@ -9,7 +9,7 @@ from datagen.blender.axes import SENSOR_WIDTH_MM, blender_lens, world_from_blend
 from datagen.blender.geometry import add_mesh, add_object_mesh, add_vertex_attribute, set_pose, set_vertices
 from datagen.blender.lights import add_light
 from datagen.blender.materials import object_material
-from datagen.blender.skin import ARM_BLEND, ARM_COLOR, REST, arm_color_and_blend, skin_material, sleeve_material
+from datagen.blender.skin import ARM_BLEND, ARM_COLOR, REST, arm_color_and_blend, skin_materials, sleeve_material
 from datagen.blender.surfaces import table_material, table_uv
 from datagen.blender.world import add_world
 from datagen.scene import SLEEVE, CameraPath, Scene, Table
@@ -79,14 +79,14 @@ def _add_hand(scene: Scene) -> bpy.types.Object:
     rest = scene.hand_verts_world[0]
     sleeve = rest[np.unique(surface.faces[surface.face_part == SLEEVE])]
     axis = np.linalg.svd(sleeve - sleeve.mean(axis=0))[2][0] if len(sleeve) else np.array([1.0, 0.0, 0.0])
-    skin = skin_material(look)
+    hand_skin, arm_skin = skin_materials(look, surface, rest, scene.seed)
     hand = add_mesh(
         "hand",
         verts=rest,
         faces=surface.faces,
         corner_uv=surface.corner_uv,
         face_material=surface.face_part,
-        materials=[skin, skin.copy(), sleeve_material(look, axis)],  # in the order of face_part
+        materials=[hand_skin, arm_skin, sleeve_material(look, axis)],  # in the order of face_part
     )
     _mark(hand, [PassIndex.HAND, PassIndex.ARM, PassIndex.ARM])
     color, blend = arm_color_and_blend(surface, rest, look)

@@ -55,7 +55,7 @@ def _metallic_roughness(graph: Graph, material: Material) -> tuple[Input, Input]
 
 def _smudged(graph: Graph, roughness: Input) -> Input:
     where = graph.node("ShaderNodeTexCoord", {}).outputs["Object"]
-    smudge = graph.remap(graph.noise(where, 45.0, detail=3.0), 0.35, 0.7, -0.3 * _SMUDGE, _SMUDGE)
+    smudge = graph.remap(graph.noise(where, 45.0, detail=1.0), 0.35, 0.7, -0.3 * _SMUDGE, _SMUDGE)
     return graph.math("ADD", roughness, smudge, clamp=True)
 
 

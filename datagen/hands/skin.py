@@ -5,18 +5,15 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 from io import BytesIO
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-from datagen.hands.pickle_file import PickleLayoutError, load_pickle
 
 __all__ = [
     "SkinBasis",
     "decode_skin",
-    "load_html_skin",
     "load_open_skin",
     "open_nail_mask_png",
     "open_skin_height_png",
@@ -114,29 +111,6 @@ def open_skin_height_png() -> bytes:
     about one millimetre.
     """
     return (_DATA / "height.png").read_bytes()
-
-
-def load_html_skin(path: Path) -> SkinBasis:
-    """`TextureBasis/model_sr/model.pkl` of the HTML hand texture model (1024 x 1024).
-
-    PickleLayoutError when the file is not of that layout.
-    """
-    data = load_pickle(path)
-    missing = {"mean", "basis", "index_map"} - set(data)
-    if missing:
-        raise PickleLayoutError(
-            f"{path}: no {sorted(missing)}; expected HTML's TextureBasis/model_sr/model.pkl"
-        )
-    basis = np.asarray(data["basis"], dtype=np.float32)
-    return SkinBasis(
-        name="html",
-        size=1024,
-        mean=np.asarray(data["mean"], dtype=np.float32).reshape(-1),
-        basis=basis,
-        index_map=np.asarray(data["index_map"], dtype=np.int64).reshape(-1),
-        axes=("",) * basis.shape[1],
-        anchors=np.zeros((0, basis.shape[1])),
-    )
 
 
 def _image(name: str, size: int) -> UInt8[np.ndarray, "row column 3"]:

@@ -185,16 +185,16 @@ def _material(file: GltfFile, entry: dict[str, Any]) -> Material:
     strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
     return Material(
         name=entry.get("name", "unnamed"),
-        base_color_rgba=tuple(pbr.get("baseColorFactor", (1.0, 1.0, 1.0, 1.0))),
+        base_color_rgba=tuple(map(float, pbr.get("baseColorFactor", (1, 1, 1, 1)))),  # type: ignore[arg-type]
         base_color_image=_texture(file, pbr.get("baseColorTexture")),
-        metallic=pbr.get("metallicFactor", 1.0),
-        roughness=pbr.get("roughnessFactor", 1.0),
+        metallic=float(pbr.get("metallicFactor", 1)),
+        roughness=float(pbr.get("roughnessFactor", 1)),
         metallic_roughness_image=_texture(file, pbr.get("metallicRoughnessTexture")),
         normal_image=_texture(file, entry.get("normalTexture")),
-        emissive_rgb=tuple(strength * value for value in entry.get("emissiveFactor", (0.0, 0.0, 0.0))),  # type: ignore[arg-type]
+        emissive_rgb=tuple(float(strength * value) for value in entry.get("emissiveFactor", (0, 0, 0))),  # type: ignore[arg-type]
         emissive_image=_texture(file, entry.get("emissiveTexture")),
-        transmission=extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0.0),
-        ior=extensions.get("KHR_materials_ior", {}).get("ior", 1.45),
+        transmission=float(extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0)),
+        ior=float(extensions.get("KHR_materials_ior", {}).get("ior", 1.45)),
     )
 
 

@@ -7,7 +7,7 @@ import zipfile
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -27,6 +27,7 @@ __all__ = ["REFERENCE_READING", "MeshFolder", "ObjectLibrary", "StarterPack", "S
 REFERENCE_READING = ReadingConfig(unit="auto", up_axis="y", max_faces=1_000_000, max_image_px=8192)
 
 
+@runtime_checkable
 class ObjectLibrary(Protocol):
     """Named objects that load the same every time."""
 

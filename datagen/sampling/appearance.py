@@ -10,7 +10,7 @@ from datagen.hands.arm import ArmStyle
 from datagen.hands.skin import (
     SkinBasis,
     decode_skin,
-    open_nail_mask_png,
+    open_nail_mask_png, open_skin_height_png,
     sample_skin_coefficients,
 )
 from datagen.scene import HandLook
@@ -78,6 +78,7 @@ def sample_look(
         sleeve_color_rgb=_sleeve_color(sleeve_rng),
         sleeve_weave=float(sleeve_rng.uniform(*config.sleeve_weave)),
         nail_mask_png=open_nail_mask_png() if skins.name == OPEN_SKIN else None,
+        skin_height_png=open_skin_height_png() if skins.name == OPEN_SKIN else None,
     )
 
 

@@ -15,7 +15,7 @@ Surface = tuple[np.ndarray, np.ndarray]
 def solid_config() -> SolidConfig:
     """Coarse, so tests take a second: 1 mm on a 10 cm object."""
     return SolidConfig(
-        level_set=LevelSetConfig(voxels_longest=64, min_voxel_m=0.0003, max_hole_m=0.004, sheet_voxels=1.8),
+        level_set=LevelSetConfig(voxels_longest=100, min_voxel_m=0.0003, max_hole_m=0.004, sheet_voxels=1.8),
         tolerance_m=5e-5,
         max_faces=12000,
     )

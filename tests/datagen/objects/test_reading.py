@@ -12,6 +12,7 @@ from PIL import Image
 from datagen.objects.errors import ObjectError
 from datagen.objects.export import mesh_to_glb
 from datagen.objects.reading import ReadingConfig, read_object, unit_of_size
+from datagen.objects.surface import sample_surface
 
 CONFIG = ReadingConfig(unit="auto", up_axis="y", max_faces=5000, max_image_px=256)
 
@@ -92,8 +93,6 @@ def test_formats_agree(tmp_path, suffix):
 
 
 def test_vertex_colours_become_an_image(tmp_path):
-    from datagen.objects.surface import sample_surface
-
     ball = trimesh.creation.icosphere(2, 0.05)
     ball.visual.vertex_colors = np.where(ball.vertices[:, 2:] > 0, [[255, 0, 0, 255]], [[0, 0, 255, 255]])
     ball.export(tmp_path / "ball.ply")

@@ -14,7 +14,7 @@ from datagen.objects.texture_quality import measure_texture_quality
 def textured(mesh, pixels: np.ndarray):
     buffer = io.BytesIO()
     Image.fromarray(pixels.astype(np.uint8)).save(buffer, format="PNG")
-    image = Material(name="image", base_color_rgba=(1, 1, 1, 1), base_color_image=buffer.getvalue())
+    image = Material(name="image", base_color_rgba=(1.0, 1.0, 1.0, 1.0), base_color_image=buffer.getvalue())
     u_v = (mesh.verts_obj[mesh.faces][..., :2] + 0.05) / 0.1
     return replace(mesh, corner_uv=u_v, materials=(image,))
 
