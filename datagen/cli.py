@@ -9,7 +9,7 @@ from typing import Any
 import click
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, TaskID
 
 from datagen.config import load_config
 from datagen.grasps.report import summarise
@@ -253,6 +253,10 @@ def _open(shard: str, out: Path) -> Shard:
     return open_shard(out / "shards" / f"shard-{int(shard):05d}" if shard.isdecimal() else shard)
 
 
+def _show_progress(bar: Progress, task: TaskID, done: int, total: int) -> None:
+    bar.update(task, completed=done, total=total)
+
+
 def _verified(path: Path) -> Iterator[ShardReport]:
     """Reports of a whole dataset or of one shard of it, with a bar on standard error."""
     is_shard = (path / "shard.json").exists()
@@ -267,5 +271,5 @@ def _verified(path: Path) -> Iterator[ShardReport]:
             yield verify_shard(
                 shard,
                 split_rule=rule,
-                progress=lambda done, total: bar.update(task, completed=done, total=total),
+                progress=functools.partial(_show_progress, bar, task),
             )

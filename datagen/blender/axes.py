@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from shards.geometry import invert_transform
 
-__all__ = ["BlenderLens", "SENSOR_WIDTH_MM", "blender_lens", "world_from_blender_camera"]
+__all__ = ["SENSOR_WIDTH_MM", "BlenderLens", "blender_lens", "world_from_blender_camera"]
 
 SENSOR_WIDTH_MM = 36.0
 

@@ -9,7 +9,14 @@ from datagen.blender.axes import SENSOR_WIDTH_MM, blender_lens, world_from_blend
 from datagen.blender.geometry import add_mesh, add_object_mesh, add_vertex_attribute, set_pose, set_vertices
 from datagen.blender.lights import add_light
 from datagen.blender.materials import object_material
-from datagen.blender.skin import ARM_BLEND, ARM_COLOR, REST, arm_color_and_blend, skin_materials, sleeve_material
+from datagen.blender.skin import (
+    ARM_BLEND,
+    ARM_COLOR,
+    REST,
+    arm_color_and_blend,
+    skin_materials,
+    sleeve_material,
+)
 from datagen.blender.surfaces import table_material, table_uv
 from datagen.blender.world import add_world
 from datagen.scene import SLEEVE, CameraPath, Scene, Table

@@ -34,7 +34,12 @@ def main(arguments: Sequence[str]) -> typing.NoReturn:
             render_passes(scene, options.frames_dir, threads=options.threads, progress=progress, log=log)
         else:
             render_scene(
-                scene, options.frames_dir, device=options.device, threads=options.threads, progress=progress, log=log
+                scene,
+                options.frames_dir,
+                device=options.device,
+                threads=options.threads,
+                progress=progress,
+                log=log,
             )
     except (SceneFileError, TextureError, DeviceError, RenderError, OSError) as error:
         status = 2 if isinstance(error, ValueError) else 1
@@ -48,8 +53,12 @@ def main(arguments: Sequence[str]) -> typing.NoReturn:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description="Render the pictures of a scene file.")
     parser.add_argument("--scene", type=Path, required=True, help="scene file (.npz)")
-    parser.add_argument("--frames-dir", type=Path, required=True, help="folder of cam-00/frame-0000.png; resumed if begun")
+    parser.add_argument(
+        "--frames-dir", type=Path, required=True, help="folder of cam-00/frame-0000.png; resumed if begun"
+    )
     parser.add_argument("--device", choices=typing.get_args(DeviceRequest), default="auto")
     parser.add_argument("--threads", type=int, default=0, help="0: every core")
-    parser.add_argument("--passes", action="store_true", help="write Cycles' Z and index passes (EXR) instead of pictures")
+    parser.add_argument(
+        "--passes", action="store_true", help="write Cycles' Z and index passes (EXR) instead of pictures"
+    )
     return parser

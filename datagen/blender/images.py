@@ -46,7 +46,9 @@ def add_image(data: bytes, what: str, *, is_color: bool) -> bpy.types.Image:
     image.colorspace_settings.name = "sRGB" if is_color else "Non-Color"
     image.alpha_mode = "CHANNEL_PACKED"
     if tuple(image.size) != decoded.size:
-        raise TextureError(f"{what}: Blender reads {tuple(image.size)} pixels of {decoded.size}; save it as PNG")
+        raise TextureError(
+            f"{what}: Blender reads {tuple(image.size)} pixels of {decoded.size}; save it as PNG"
+        )
     return image
 
 
@@ -70,4 +72,6 @@ def coded_normals(
     """Tangent-space normals of a relief, coded 0..1; lowest row first, as `add_drawn_image` takes it."""
     slope_y, slope_x = np.gradient(height_m, texel_m)
     length = np.sqrt(1.0 + slope_x**2 + slope_y**2)
-    return (0.5 + 0.5 * np.stack([-slope_x, -slope_y, np.ones_like(length)], axis=-1) / length[..., None]).astype(np.float32)
+    return (
+        0.5 + 0.5 * np.stack([-slope_x, -slope_y, np.ones_like(length)], axis=-1) / length[..., None]
+    ).astype(np.float32)

@@ -27,18 +27,29 @@ class Graph:
 
     def math(self, operation: str, *operands: Input, clamp: bool = False) -> bpy.types.NodeSocket:
         """A Math node, e.g. math("MULTIPLY", a, 2.0)."""
-        return self.node("ShaderNodeMath", dict(enumerate(operands)), operation=operation, use_clamp=clamp).outputs[0]
+        return self.node(
+            "ShaderNodeMath", dict(enumerate(operands)), operation=operation, use_clamp=clamp
+        ).outputs[0]
 
     def vector(self, operation: str, *operands: Input) -> bpy.types.NodeSocket:
         """A Vector Math node with a vector result."""
         return self.node("ShaderNodeVectorMath", dict(enumerate(operands)), operation=operation).outputs[0]
 
-    def noise(self, where: Input, scale: float, detail: float = 2.0, roughness: float = 0.5) -> bpy.types.NodeSocket:
+    def noise(
+        self, where: Input, scale: float, detail: float = 2.0, roughness: float = 0.5
+    ) -> bpy.types.NodeSocket:
         """Gradient noise in 0..1, mean 0.5; `scale` is features per metre when `where` is in metres."""
-        inputs: dict[str | int, Input] = {"Vector": where, "Scale": scale, "Detail": detail, "Roughness": roughness}
+        inputs: dict[str | int, Input] = {
+            "Vector": where,
+            "Scale": scale,
+            "Detail": detail,
+            "Roughness": roughness,
+        }
         return self.node("ShaderNodeTexNoise", inputs).outputs["Fac"]
 
-    def remap(self, value: Input, low: float, high: float, to_low: float, to_high: float) -> bpy.types.NodeSocket:
+    def remap(
+        self, value: Input, low: float, high: float, to_low: float, to_high: float
+    ) -> bpy.types.NodeSocket:
         """Smooth step of `value` from [low, high] to [to_low, to_high], clamped."""
         inputs: dict[str | int, Input] = {0: value, 1: low, 2: high, 3: to_low, 4: to_high}
         return self.node("ShaderNodeMapRange", inputs, interpolation_type="SMOOTHSTEP").outputs[0]

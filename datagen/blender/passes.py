@@ -22,7 +22,9 @@ def pass_path(frames_dir: Path, camera: int, frame: int) -> Path:
     return frames_dir / f"cam-{camera:02d}" / f"passes-{frame:04d}.exr"
 
 
-def render_passes(scene: Scene, frames_dir: Path, *, threads: int, progress: Progress, log: BlenderLog) -> None:
+def render_passes(
+    scene: Scene, frames_dir: Path, *, threads: int, progress: Progress, log: BlenderLog
+) -> None:
     """One sample per pixel, at the pixel's centre, for every camera and frame. CPU only."""
     built = build_scene(scene)
     apply_settings(scene.render, select_device("cpu"), threads)

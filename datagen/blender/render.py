@@ -38,11 +38,18 @@ def frame_path(frames_dir: Path, camera: int, frame: int) -> Path:
 
 
 def render_scene(
-    scene: Scene, frames_dir: Path, *, device: DeviceRequest, threads: int, progress: Progress, log: BlenderLog
+    scene: Scene,
+    frames_dir: Path,
+    *,
+    device: DeviceRequest,
+    threads: int,
+    progress: Progress,
+    log: BlenderLog,
 ) -> None:
     """Write all pictures that are not there yet, frames outer and cameras inner.
 
-    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop.
+    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop (figures in
+    DECISIONS.md).
     Raises DeviceError, TextureError, RenderError.
     """
     started = time.perf_counter()
@@ -56,10 +63,19 @@ def render_scene(
     seconds = {"build": time.perf_counter() - started, "sync": 0.0, "render": 0.0, "write": 0.0}
     common = {"device": used.backend, "device_names": used.names, "bpy_version": bpy.app.version_string}
     progress.send(
-        "start", pictures=n_pictures, skipped=n_pictures - len(missing), resume_key=key, seconds=dict(seconds), **common
+        "start",
+        pictures=n_pictures,
+        skipped=n_pictures - len(missing),
+        resume_key=key,
+        seconds=dict(seconds),
+        **common,
     )
     clock = _PhaseClock()
+    shown = None
     for picture in missing:
+        if picture.frame != shown:  # touching a mesh makes Cycles rebuild its BVH
+            show_frame(built, picture.frame)
+            shown = picture.frame
         spent = _render_picture(built, picture, clock, log)
         for phase, value in spent.items():
             seconds[phase] += value
@@ -107,11 +123,12 @@ def _missing_pictures(scene: Scene, frames_dir: Path, key: str) -> list[Picture]
     return [picture for picture in pictures if not picture.path.is_file()]
 
 
-def _render_picture(built: BuiltScene, picture: Picture, clock: "_PhaseClock", log: BlenderLog) -> dict[str, float]:
+def _render_picture(
+    built: BuiltScene, picture: Picture, clock: "_PhaseClock", log: BlenderLog
+) -> dict[str, float]:
     scene, blender = built.scene, bpy.context.scene
     started = time.perf_counter()
     camera = scene.cameras[picture.camera]
-    show_frame(built, picture.frame)
     use_camera(built, camera, picture.frame)
     blender.cycles.seed = sampling_seed(scene.seed, picture.camera, picture.frame)
     picture.path.parent.mkdir(parents=True, exist_ok=True)

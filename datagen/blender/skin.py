@@ -88,7 +88,9 @@ def _relief_image(
         glossy = look.skin_roughness + (_NAIL_ROUGHNESS - look.skin_roughness) * look.nail_gloss
         roughness = roughness + nails * (glossy - roughness)
     height_m = look.bump * relief.height_m[::-1]
-    coded = np.concatenate([coded_normals(height_m, texel_m), np.clip(roughness[::-1, :, None], 0.05, 1.0)], axis=-1)
+    coded = np.concatenate(
+        [coded_normals(height_m, texel_m), np.clip(roughness[::-1, :, None], 0.05, 1.0)], axis=-1
+    )
     return add_drawn_image("skin relief", coded.astype(np.float32), is_color=False)
 
 
@@ -96,12 +98,16 @@ def sleeve_material(look: HandLook, axis: Float[np.ndarray, "3"]) -> bpy.types.M
     """Woven cloth around an arm along `axis` (unit vector in the first frame)."""
     material, graph = new_material("sleeve")
     rest = graph.attribute(REST, "Vector")
-    along = graph.node("ShaderNodeVectorMath", {0: rest, 1: tuple(axis)}, operation="DOT_PRODUCT").outputs["Value"]
+    along = graph.node("ShaderNodeVectorMath", {0: rest, 1: tuple(axis)}, operation="DOT_PRODUCT").outputs[
+        "Value"
+    ]
     thread = _THREAD_M * look.sleeve_weave
     # Threads across the arm, and a finer fibre noise: close up it is cloth, far away it is its mean.
     warp = graph.math("SINE", graph.math("MULTIPLY", along, 2.0 * np.pi / thread))
     fibre = graph.noise(rest, 0.9 / thread, detail=1.0)
-    weave = graph.math("ADD", graph.math("MULTIPLY", warp, 0.10 * thread), graph.math("MULTIPLY", fibre, 0.45 * thread))
+    weave = graph.math(
+        "ADD", graph.math("MULTIPLY", warp, 0.10 * thread), graph.math("MULTIPLY", fibre, 0.45 * thread)
+    )
     worn = graph.remap(fibre, 0.25, 0.75, 0.82, 1.12)
     color = graph.mix(1.0, look.sleeve_color_rgb, graph.combine(worn, worn, worn), blend="MULTIPLY")
     surface(

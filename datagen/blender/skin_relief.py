@@ -33,7 +33,9 @@ def texel_size_m(topology: HandSurface, verts: Float[np.ndarray, "vert 3"], text
     corners, uv = verts[topology.faces[hand]], topology.corner_uv[hand]
     edges, uv_edges = corners[:, 1:] - corners[:, :1], uv[:, 1:] - uv[:, :1]
     area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1).sum()
-    uv_area = 0.5 * np.abs(uv_edges[:, 0, 0] * uv_edges[:, 1, 1] - uv_edges[:, 0, 1] * uv_edges[:, 1, 0]).sum()
+    uv_area = (
+        0.5 * np.abs(uv_edges[:, 0, 0] * uv_edges[:, 1, 1] - uv_edges[:, 0, 1] * uv_edges[:, 1, 0]).sum()
+    )
     if not uv_area > 0.0:
         raise ValueError("hand surface: the UV map of the hand has no area; skin cannot be drawn on it")
     return float(np.sqrt(area / uv_area) / texture_px)
@@ -46,7 +48,9 @@ def skin_relief(
     brightness = cv2.cvtColor(skin_rgb, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
     painted = (brightness > 0.0).astype(np.float32)  # textures are black where no skin is mapped
     broad_px = _CREASE_WIDTH_M / texel_m
-    broad = cv2.GaussianBlur(brightness, (0, 0), broad_px) / np.maximum(cv2.GaussianBlur(painted, (0, 0), broad_px), 0.05)
+    broad = cv2.GaussianBlur(brightness, (0, 0), broad_px) / np.maximum(
+        cv2.GaussianBlur(painted, (0, 0), broad_px), 0.05
+    )
     crease = cv2.GaussianBlur(brightness - broad, (0, 0), 0.8) * cv2.erode(painted, np.ones((5, 5), np.uint8))
 
     shape = brightness.shape

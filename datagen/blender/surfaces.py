@@ -48,4 +48,6 @@ def table_uv(
 
 
 def _srgb(linear: Float32[np.ndarray, "row column 3"]) -> Float32[np.ndarray, "row column 3"]:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055).astype(np.float32)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055).astype(
+        np.float32
+    )

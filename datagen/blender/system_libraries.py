@@ -50,7 +50,8 @@ def blender_import_problem() -> str | None:
         except ImportError as error:
             packages = packages_of(str(error))
             if not packages:
-                return f"Blender's module does not load: {error}\nInstall it with: pip install 'bpy==4.5.*' (Python 3.11)"
+                fix = "Install it with: pip install 'bpy==4.5.*' (Python 3.11)"
+                return f"Blender's module does not load: {error}\n{fix}"
         else:
             return None
     return (

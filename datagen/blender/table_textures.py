@@ -53,7 +53,9 @@ class _Canvas:
                 for n, size in zip(self.shape, (size_y, size_x))
             ]
             lattice = self.rng.standard_normal(cells, dtype=np.float32)
-            total += np.float32(gain**octave) * cv2.resize(lattice, self.shape[::-1], interpolation=cv2.INTER_CUBIC)
+            total += np.float32(gain**octave) * cv2.resize(
+                lattice, self.shape[::-1], interpolation=cv2.INTER_CUBIC
+            )
         return (total - total.mean()) / max(float(total.std()), 1e-6)
 
 
@@ -62,7 +64,9 @@ def draw_table(table: Table) -> TableTextures:
     texel_m = max(TEXEL_M, max(table.size_xy_m) / MAX_TEXTURE_PX)
     columns, rows = (max(8, round(side / texel_m)) for side in table.size_xy_m)
     canvas = _Canvas(
-        shape=(rows, columns), texel=texel_m / table.pattern_scale, rng=np.random.default_rng(table.pattern_seed)
+        shape=(rows, columns),
+        texel=texel_m / table.pattern_scale,
+        rng=np.random.default_rng(table.pattern_seed),
     )
     draw = {"wood": _wood, "stone": _stone, "cloth": _cloth, "laminate": _laminate}[table.material]
     color, roughness, height = draw(canvas, table)
@@ -101,10 +105,14 @@ def _wood(canvas: _Canvas, table: Table) -> tuple[Color, Field, Field]:
             cut = depth + slope * x[here] + 0.008 * warp[here]
             radius = np.hypot(y_in[:, piece_of == piece] - y_pith, cut) + 0.0012 * wobble[here]
             phase = np.mod(radius / spacing, 1.0)
-            ring[here] = phase**2.2 * (1.0 - np.clip((phase - 0.88) / 0.12, 0.0, 1.0))  # slow darkening, sharp end
+            ring[here] = phase**2.2 * (
+                1.0 - np.clip((phase - 0.88) / 0.12, 0.0, 1.0)
+            )  # slow darkening, sharp end
             tone[here] = rng.normal(0.0, 0.10)
             x_in = x[here] + start - piece * length
-            edge = np.minimum(np.minimum(x_in, length - x_in), np.minimum(y_in, width - y_in)[:, piece_of == piece])
+            edge = np.minimum(
+                np.minimum(x_in, length - x_in), np.minimum(y_in, width - y_in)[:, piece_of == piece]
+            )
             joint[here] = np.clip((edge - 0.0002) / 0.0009, 0.0, 1.0)
 
     light = 0.62 - 0.42 * ring + 0.075 * fibres + 0.10 * streaks + 0.06 * warp + tone
@@ -124,7 +132,9 @@ def _stone(canvas: _Canvas, table: Table) -> tuple[Color, Field, Field]:
     small = _warped(canvas, canvas.noise(0.13, 0.10, octaves=4, gain=0.6), bend_y, bend_x)
     clouds = canvas.noise(0.25, 0.25, octaves=5, gain=0.6)
     presence = np.clip(0.5 + 0.5 * canvas.noise(0.35, 0.35, octaves=2), 0.0, 1.0)  # veins come and go
-    vein = presence * np.exp(-((large / 0.055) ** 2)) + 0.35 * (1.0 - presence) * np.exp(-((small / 0.05) ** 2))
+    vein = presence * np.exp(-((large / 0.055) ** 2)) + 0.35 * (1.0 - presence) * np.exp(
+        -((small / 0.05) ** 2)
+    )
     halo = 0.22 * np.exp(-np.abs(large) / 0.35)
     grain = canvas.noise(0.0012, 0.0012, octaves=2)
     color = _between(table.color_a_rgb, table.color_b_rgb, 0.10 + vein + halo + 0.07 * clouds + 0.02 * grain)
@@ -138,7 +148,9 @@ def _cloth(canvas: _Canvas, table: Table) -> tuple[Color, Field, Field]:
     warp, weft = canvas.noise(0.0012, 0.03, octaves=2), canvas.noise(0.03, 0.0012, octaves=2)
     period = canvas.rng.choice([0.024, 0.036, 0.060])
     stripe_x, stripe_y = (np.mod(axis / period, 1.0) < 0.5 for axis in (x, y))
-    pattern = [np.zeros(canvas.shape), 1.0 * stripe_x, 0.5 * stripe_x + 0.5 * stripe_y][canvas.rng.integers(3)]
+    pattern = [np.zeros(canvas.shape), 1.0 * stripe_x, 0.5 * stripe_x + 0.5 * stripe_y][
+        canvas.rng.integers(3)
+    ]
     thread = 0.5 * (warp + weft)
     color = _between(table.color_a_rgb, table.color_b_rgb, pattern) * (1.0 + 0.10 * thread)[..., None]
     wrinkles = canvas.noise(0.22, 0.16, octaves=3, gain=0.4)
@@ -164,7 +176,9 @@ def _laminate(canvas: _Canvas, table: Table) -> tuple[Color, Field, Field]:
     return color, table.roughness + 0.03 * wiped + 0.02 * smudge, 0.000012 * peel
 
 
-def _between(a_rgb: tuple[float, float, float], b_rgb: tuple[float, float, float], amount: np.ndarray) -> Color:
+def _between(
+    a_rgb: tuple[float, float, float], b_rgb: tuple[float, float, float], amount: np.ndarray
+) -> Color:
     a, b = np.asarray(a_rgb, np.float32), np.asarray(b_rgb, np.float32)
     return a + np.clip(amount, 0.0, 1.0).astype(np.float32)[..., None] * (b - a)
 
@@ -175,5 +189,9 @@ def _warped(canvas: _Canvas, field: Field, shift_x: Field, shift_y: Field) -> Fi
     column = np.arange(columns, dtype=np.float32) + shift_x / np.float32(canvas.texel)
     row = np.arange(rows, dtype=np.float32)[:, None] + shift_y / np.float32(canvas.texel)
     return cv2.remap(
-        field, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
+        field,
+        column.astype(np.float32),
+        row.astype(np.float32),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REFLECT,
     )

@@ -32,7 +32,9 @@ def hdri_path(name: str) -> Path:
     path = folder / f"{name}.exr"
     if not path.is_file():
         names = sorted(p.stem for p in folder.glob("*.exr"))
-        raise TextureError(f"no HDRI called {name!r}; Blender ships {', '.join(names)}; or give the path of an .exr")
+        raise TextureError(
+            f"no HDRI called {name!r}; Blender ships {', '.join(names)}; or give the path of an .exr"
+        )
     return path
 
 
@@ -46,7 +48,10 @@ def add_world(background: Background) -> None:
     graph = Graph(world.node_tree)
     direction = graph.node(
         "ShaderNodeMapping",
-        {"Vector": graph.node("ShaderNodeTexCoord", {}).outputs["Generated"], "Rotation": (0.0, 0.0, background.rotation_rad)},
+        {
+            "Vector": graph.node("ShaderNodeTexCoord", {}).outputs["Generated"],
+            "Rotation": (0.0, 0.0, background.rotation_rad),
+        },
     ).outputs[0]
     # Mixed as shaders, not as colours: Cycles then skips the branch a ray does not see.
     light = _environment(graph, "light", radiance, direction, background.strength, "Linear")
@@ -72,8 +77,12 @@ def _environment(
     upward = radiance[::-1]  # Blender's first row is the lowest
     image.pixels.foreach_set(np.concatenate([upward, np.ones_like(upward[..., :1])], axis=-1).reshape(-1))
     image.update()
-    texture = graph.node("ShaderNodeTexEnvironment", {"Vector": direction}, image=image, interpolation=filtering)
-    return graph.node("ShaderNodeBackground", {"Color": texture.outputs["Color"], "Strength": strength}).outputs[0]
+    texture = graph.node(
+        "ShaderNodeTexEnvironment", {"Vector": direction}, image=image, interpolation=filtering
+    )
+    return graph.node(
+        "ShaderNodeBackground", {"Color": texture.outputs["Color"], "Strength": strength}
+    ).outputs[0]
 
 
 def _read_normalised(path: Path) -> Float32[np.ndarray, "row column 3"]:
@@ -101,7 +110,8 @@ def _backdrop(radiance: Float32[np.ndarray, "row column 3"]) -> Float32[np.ndarr
     weights /= weights.sum()
     tamed = np.minimum(radiance, np.float32(_BACKDROP_MAX))
     for axis, mode in ((0, "edge"), (1, "wrap")):
-        padded = np.pad(tamed, [(reach, reach) if a == axis else (0, 0) for a in range(3)], mode=mode)
+        width = [(reach, reach) if a == axis else (0, 0) for a in range(3)]
+        padded = np.pad(tamed, width, mode=mode)  # type: ignore[call-overload]
         n = tamed.shape[axis]
         tamed = sum(w * padded.take(range(i, i + n), axis=axis) for i, w in enumerate(weights))
     return tamed.astype(np.float32)

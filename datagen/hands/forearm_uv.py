@@ -39,5 +39,7 @@ def _affine_uv(
     """UV of three points per face under the affine map of one triangle (extended beyond its edges)."""
     edges = np.stack([triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]], axis=-1)
     coordinates = np.linalg.pinv(edges) @ np.swapaxes(points - triangles[:, :1], 1, 2)
-    uv_edges = np.stack([triangle_uv[:, 1] - triangle_uv[:, 0], triangle_uv[:, 2] - triangle_uv[:, 0]], axis=-1)
+    uv_edges = np.stack(
+        [triangle_uv[:, 1] - triangle_uv[:, 0], triangle_uv[:, 2] - triangle_uv[:, 0]], axis=-1
+    )
     return triangle_uv[:, :1] + np.swapaxes(uv_edges @ coordinates, 1, 2)

@@ -80,7 +80,9 @@ def shape_hand(model: HandModel, betas: Float[np.ndarray, "beta"]) -> ShapedHand
     if len(betas) > n:
         raise ValueError(f"hand model {model.name!r} has {n} shape coefficients, found {len(betas)}")
     verts_rest = model.v_template + model.shapedirs[..., : len(betas)] @ betas
-    return ShapedHand(model=model, betas=betas, verts_rest=verts_rest, joints_rest=model.J_regressor @ verts_rest)
+    return ShapedHand(
+        model=model, betas=betas, verts_rest=verts_rest, joints_rest=model.J_regressor @ verts_rest
+    )
 
 
 def pose_hand(
@@ -110,11 +112,15 @@ def pose_hand(
     verts_world += translation_world[:, None]
     T_world_from_joint[..., :3, 3] += translation_world[:, None]
     joints_world = np.concatenate([T_world_from_joint[..., :3, 3], verts_world[:, model.tip_ids]], axis=1)
-    return PosedHand(verts_world=verts_world, T_world_from_joint=T_world_from_joint, joints_world=joints_world)
+    return PosedHand(
+        verts_world=verts_world, T_world_from_joint=T_world_from_joint, joints_world=joints_world
+    )
 
 
 def _chain(
-    R: Float[np.ndarray, "frame 16 3 3"], joints_rest: Float[np.ndarray, "16 3"], parents: Int[np.ndarray, "16"]
+    R: Float[np.ndarray, "frame 16 3 3"],
+    joints_rest: Float[np.ndarray, "16 3"],
+    parents: Int[np.ndarray, "16"],
 ) -> Float[np.ndarray, "frame 16 4 4"]:
     """Forward kinematics: compose local rotations about the rest joints from the wrist outward."""
     T = np.zeros((len(R), 16, 4, 4))

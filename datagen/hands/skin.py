@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
 
-
 __all__ = [
     "SkinBasis",
     "decode_skin",

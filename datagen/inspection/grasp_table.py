@@ -20,7 +20,8 @@ def grasp_table(report: GraspReport) -> Table:
     table.add_section()
     table.add_row(*_cells(report.total))
     failed = ", ".join(f"{reason} {count}" for reason, count in report.total.failures.items())
-    table.caption = f"{report.objects_kept_share:.0%} of objects with a kept grasp; slip in lift/turn. Failed: {failed or 'none'}"
+    kept = f"{report.objects_kept_share:.0%} of objects with a kept grasp"
+    table.caption = f"{kept}; slip in lift/turn. Failed attempts: {failed or 'none'}"
     return table
 
 

@@ -59,12 +59,10 @@ def draw_labels(
 
 
 def _draw_joints(canvas: UInt8[np.ndarray, "height width 3"], joints_px: Float[np.ndarray, "21 2"]) -> None:
-    points = [
-        None if np.isnan(p).any() else (round(p[0] - 0.5), round(p[1] - 0.5)) for p in joints_px.tolist()
-    ]
     for number, (a, b) in enumerate(BONES):
-        if points[a] is not None and points[b] is not None:
-            cv2.line(canvas, points[a], points[b], DIGIT_COLORS[number // 4], 1, cv2.LINE_AA)
+        if not np.isnan(joints_px[[a, b]]).any():
+            start, end = np.round(joints_px[[a, b]] - 0.5).astype(int).tolist()
+            cv2.line(canvas, start, end, DIGIT_COLORS[number // 4], 1, cv2.LINE_AA)
 
 
 def _draw_axes(

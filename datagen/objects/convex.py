@@ -41,9 +41,7 @@ class HullFit:
     uncovered_max_m: float
 
 
-def convex_parts(
-    solid: ClosedSurface, config: ConvexConfig
-) -> tuple[tuple[ConvexPart, ...], HullFit]:
+def convex_parts(solid: ClosedSurface, config: ConvexConfig) -> tuple[tuple[ConvexPart, ...], HullFit]:
     """The decomposition with the smallest excess, and its fit. Deterministic."""
     verts, faces = _lightened(solid, config.max_faces)
     coacd.set_log_level("error")

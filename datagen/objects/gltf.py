@@ -50,7 +50,9 @@ def read_gltf(path: Path, data: bytes) -> FileMesh:
 
 
 def _refuse_what_moves_or_is_packed(file: GltfFile) -> None:
-    packed = [name for name in file.json.get("extensionsRequired", []) if "draco" in name or "meshopt" in name]
+    packed = [
+        name for name in file.json.get("extensionsRequired", []) if "draco" in name or "meshopt" in name
+    ]
     if packed:
         raise ObjectError(
             file.path,
@@ -175,7 +177,9 @@ def _texture(file: GltfFile, info: dict[str, Any] | None) -> bytes | None:
     if info is None:
         return None
     texture = file.json["textures"][info["index"]]
-    source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source", texture.get("source"))
+    source = (
+        texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source", texture.get("source"))
+    )
     return None if source is None else file.image(source)
 
 

@@ -122,7 +122,8 @@ def open_gltf(path: Path, data: bytes) -> GltfFile:
 
 
 def _glb_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
-    offset, chunks = 12, {}
+    offset = 12
+    chunks: dict[bytes, bytes] = {}
     while offset + 8 <= len(data):
         length, kind = struct.unpack_from("<I4s", data, offset)
         chunk = data[offset + 8 : offset + 8 + length]

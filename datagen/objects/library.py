@@ -4,7 +4,6 @@ import csv
 import io
 import json
 import zipfile
-from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -92,7 +91,9 @@ class MeshFolder:
         self, path: Path, reading: ReadingConfig, preparation: PreparationConfig, cache_dir: Path
     ) -> None:
         if not path.is_dir():
-            raise ObjectError(path, "is not a folder", expected="a folder of meshes", action="Check the path.")
+            raise ObjectError(
+                path, "is not a folder", expected="a folder of meshes", action="Check the path."
+            )
         self._path, self._reading = path, reading
         self._preparation, self._cache_dir = preparation, cache_dir.expanduser()
         self._files = {

@@ -17,7 +17,9 @@ RAYS_PER_PATCH = 96
 CLEAR_MARGIN = 0.02  # escape rates closer than this do not tell the sides apart
 
 
-def ray_intersector(verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"]) -> RayMeshIntersector:
+def ray_intersector(
+    verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"]
+) -> RayMeshIntersector:
     """Embree over a triangle mesh."""
     return RayMeshIntersector(Trimesh(verts, faces, process=False))
 
@@ -60,7 +62,9 @@ def _without_repeats(mesh: ObjectMesh) -> ObjectMesh:
     )
 
 
-def _is_mirrored(faces: Int[np.ndarray, "face 3"], other: Int[np.ndarray, "face 3"]) -> Bool[np.ndarray, "face"]:
+def _is_mirrored(
+    faces: Int[np.ndarray, "face 3"], other: Int[np.ndarray, "face 3"]
+) -> Bool[np.ndarray, "face"]:
     """True where `other` runs through the same three vertices the other way round."""
     same = np.zeros(len(faces), dtype=bool)
     for shift in range(3):
@@ -81,10 +85,7 @@ def _inward_patches(
     order = np.argsort(patch, kind="stable")
     starts = np.searchsorted(patch[order], np.arange(n_patches + 1))
     faces = np.concatenate(
-        [
-            _area_weighted(order[starts[k] : starts[k + 1]], areas, rng)
-            for k in range(n_patches)
-        ]
+        [_area_weighted(order[starts[k] : starts[k + 1]], areas, rng) for k in range(n_patches)]
     )
     barycentric = rng.dirichlet(np.ones(3), len(faces))
     points = np.einsum("pk,pkc->pc", barycentric, mesh.verts_obj[mesh.faces[faces]])

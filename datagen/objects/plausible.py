@@ -11,7 +11,19 @@ __all__ = ["MtlEntry", "material_from_mtl"]
 
 RGB = tuple[float, float, float]
 
-METAL_WORDS = ("chrome", "krome", "metal", "steel", "silver", "gold", "brass", "copper", "iron", "alumin", "inox")
+METAL_WORDS = (
+    "chrome",
+    "krome",
+    "metal",
+    "steel",
+    "silver",
+    "gold",
+    "brass",
+    "copper",
+    "iron",
+    "alumin",
+    "inox",
+)
 GLASS_WORDS = ("glass", "verre", "cristal", "crystal", "pane")
 
 
@@ -52,13 +64,17 @@ class MtlEntry:
             ior=number("ni", 1.0),
             roughness=number("pr", 0.5) if "pr" in words else None,
             metallic=number("pm", 0.0) if "pm" in words else None,
-            maps={key: _file_name(value) for key, value in words.items() if key in ("map_kd", "map_ke", "norm")},
+            maps={
+                key: _file_name(value) for key, value in words.items() if key in ("map_kd", "map_ke", "norm")
+            },
         )
 
 
 def _file_name(words: list[str]) -> str:
     """The name after options such as `-s 1 1 1`; names may contain spaces."""
-    last_option = max((k for k, word in enumerate(words) if word.startswith("-") and len(word) > 1), default=None)
+    last_option = max(
+        (k for k, word in enumerate(words) if word.startswith("-") and len(word) > 1), default=None
+    )
     if last_option is None:
         return " ".join(words)
     return " ".join(words[last_option + 1 :][-1:])

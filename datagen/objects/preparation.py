@@ -42,9 +42,7 @@ class PreparationConfig:
 # What the starter pack was built with; libraries of other meshes use the same.
 REFERENCE_PREPARATION = PreparationConfig(
     solid=SolidConfig(
-        level_set=LevelSetConfig(
-            voxels_longest=192, min_voxel_m=0.0003, max_hole_m=0.004, sheet_voxels=1.8
-        ),
+        level_set=LevelSetConfig(voxels_longest=192, min_voxel_m=0.0003, max_hole_m=0.004, sheet_voxels=1.8),
         tolerance_m=5e-5,
         max_faces=12000,
     ),
@@ -108,7 +106,9 @@ def _distance_to(
     return np.sqrt(squared)
 
 
-def _key(verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"], config: PreparationConfig) -> str:
+def _key(
+    verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"], config: PreparationConfig
+) -> str:
     digest = hashlib.sha256(f"{CACHE_VERSION} {asdict(config)}".encode())
     digest.update(np.ascontiguousarray(verts, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(faces, dtype="<i8").tobytes())

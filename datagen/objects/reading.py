@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 from PIL import Image, UnidentifiedImageError
+from trimesh.visual import ColorVisuals
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.file_mesh import FileMesh
@@ -84,11 +85,12 @@ def _read_ply_or_stl(path: Path) -> FileMesh:
     faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
     colors = None
     # PLY colours are display colours by custom.
-    if loaded.visual.kind == "face":
-        by_face = np.asarray(loaded.visual.face_colors, dtype=np.float64)[:, :3] / 255.0
+    visual = loaded.visual
+    if isinstance(visual, ColorVisuals) and visual.kind == "face":
+        by_face = np.asarray(visual.face_colors, dtype=np.float64)[:, :3] / 255.0
         colors = np.repeat(linear_from_srgb(by_face)[:, None], 3, axis=1)
-    elif loaded.visual.kind == "vertex":
-        by_vertex = np.asarray(loaded.visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
+    elif isinstance(visual, ColorVisuals) and visual.kind == "vertex":
+        by_vertex = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
         colors = linear_from_srgb(by_vertex)[faces]
     plain = Material(name="plain", base_color_rgba=(0.6, 0.6, 0.6, 1.0))
     return FileMesh(

@@ -137,9 +137,7 @@ def _barycentric_step(
     unit_b = edge_b / np.maximum(np.linalg.norm(edge_b, axis=1, keepdims=True), 1e-12)
     angle = rng.random(len(corners))[:, None] * 2 * np.pi
     step = length * (np.cos(angle) * unit_b + np.sin(angle) * np.cross(normals, unit_b))
-    gram = np.stack(
-        [(edge_b**2).sum(1), (edge_b * edge_c).sum(1), (edge_c**2).sum(1)], axis=1
-    )
+    gram = np.stack([(edge_b**2).sum(1), (edge_b * edge_c).sum(1), (edge_c**2).sum(1)], axis=1)
     determinant = np.maximum(gram[:, 0] * gram[:, 2] - gram[:, 1] ** 2, 1e-24)
     on_b, on_c = (step * edge_b).sum(1), (step * edge_c).sum(1)
     beta = (gram[:, 2] * on_b - gram[:, 1] * on_c) / determinant

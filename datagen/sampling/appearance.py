@@ -10,7 +10,8 @@ from datagen.hands.arm import ArmStyle
 from datagen.hands.skin import (
     SkinBasis,
     decode_skin,
-    open_nail_mask_png, open_skin_height_png,
+    open_nail_mask_png,
+    open_skin_height_png,
     sample_skin_coefficients,
 )
 from datagen.scene import HandLook

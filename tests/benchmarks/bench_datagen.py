@@ -37,7 +37,18 @@ def one_motion_config(folder: Path, **cameras: object) -> Path:
 
 def render(config: Path, out: Path) -> dict[str, float]:
     """Render shard 0; the motion's seconds per phase."""
-    command = [sys.executable, "-m", "datagen", "render", "--config", str(config), "--out", str(out), "--shard", "0"]
+    command = [
+        sys.executable,
+        "-m",
+        "datagen",
+        "render",
+        "--config",
+        str(config),
+        "--out",
+        str(out),
+        "--shard",
+        "0",
+    ]
     subprocess.run([*command, "--device", "cpu"], check=True, cwd=ROOT, capture_output=True)
     (motion,) = open_dataset(out).shards[0].record.motions
     return motion.timings_s
@@ -48,10 +59,16 @@ def test_overhead_outside_cycles(tmp_path, say):
     cycles = seconds["blender.render"]
     others = {
         "blender start, build, sync, write": seconds["blender"] - cycles,
-        **{phase: s for phase, s in seconds.items() if phase not in NOT_OVERHEAD and not phase.startswith("blender.")},
+        **{
+            phase: s
+            for phase, s in seconds.items()
+            if phase not in NOT_OVERHEAD and not phase.startswith("blender.")
+        },
     }
     overhead = sum(others.values())
-    say(f"Cycles {cycles:.1f} s; outside Cycles {overhead:.1f} s = {overhead / cycles:.1%} (claim: at most 15 %)")
+    say(
+        f"Cycles {cycles:.1f} s; outside Cycles {overhead:.1f} s = {overhead / cycles:.1%} (claim: at most 15 %)"
+    )
     for phase, s in sorted(others.items(), key=lambda item: -item[1]):
         say(f"    {phase:36s} {s:6.2f} s  {s / cycles:6.1%}")
     say(f"    grasp synthesis (not counted)        {seconds['grasp']:6.2f} s")
@@ -89,7 +106,10 @@ def test_resident_memory_over_500_frames(tmp_path, say):
     command = [sys.executable, str(RENDER_SCRIPT), "--scene", str(tmp_path / "scene.npz"), "--device", "cpu"]
     rss_mb = []
     with subprocess.Popen(
-        [*command, "--frames-dir", str(tmp_path / "frames")], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        [*command, "--frames-dir", str(tmp_path / "frames")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
     ) as child:
         assert child.stdout is not None
         for line in child.stdout:
@@ -99,4 +119,6 @@ def test_resident_memory_over_500_frames(tmp_path, say):
     assert child.returncode == 0
     settled = np.array(rss_mb[20:])  # Cycles allocates its pools during the first pictures
     growth = float(np.median(settled[-50:]) - np.median(settled[:50]))
-    say(f"render child: {len(rss_mb)} frames, resident {settled[0]:.0f} MB, growth {growth:+.1f} MB (claim: < 5 MB)")
+    say(
+        f"render child: {len(rss_mb)} frames, resident {settled[0]:.0f} MB, growth {growth:+.1f} MB (claim: < 5 MB)"
+    )

@@ -28,7 +28,7 @@ def test_failure_carries_status_and_end_of_log(tmp_path):
     code = (
         "import sys; [print(i, file=sys.stderr) for i in range(100)]; sys.exit('texture missing: wood.png')"
     )
-    with pytest.raises(ChildError, match="texture missing: wood.png") as caught:
+    with pytest.raises(ChildError, match=r"texture missing: wood\.png") as caught:
         run_child(python(code), log=tmp_path / "child.log", on_event=print)
     assert caught.value.status == 1
     assert "\n5\n" not in str(caught.value)  # the log is in its file, the message has its end

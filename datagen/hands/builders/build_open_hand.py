@@ -34,7 +34,9 @@ OUT = Path(__file__).resolve().parent.parent / "data" / "open_hand.npz"
 
 def main() -> None:
     """Build, write and print the segment table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--base", type=Path, default=BASE)
     parser.add_argument("--out", type=Path, default=OUT)
     options = parser.parse_args()
@@ -44,7 +46,11 @@ def main() -> None:
     print(f"{options.out}: {options.out.stat().st_size / 1e3:.0f} kB, {len(hand.v_template)} vertices")
     print("segment lengths, deviation from the published fractions: before -> after")
     for digit in SEGMENT_FRACTIONS:
-        before, after, mm = (segment_deviation(base, digit), segment_deviation(hand, digit), segment_lengths(hand, digit))
+        before, after, mm = (
+            segment_deviation(base, digit),
+            segment_deviation(hand, digit),
+            segment_lengths(hand, digit),
+        )
         cells = [f"{1e3 * length:5.1f} mm {b:+6.1%} -> {a:+5.1%}" for length, b, a in zip(mm, before, after)]
         print(f"  {digit:7s}" + " | ".join(cells))
 

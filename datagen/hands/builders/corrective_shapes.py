@@ -2,10 +2,10 @@
 
 Linear blending moves a vertex along the chord between its two bones' positions, so flesh at a
 bent joint falls towards the pivot. The reference turns it along the arc instead: by its share of
-the joint's rotation, about the pivot, which keeps its distance. What volume the hand still lacks (or has
-too much) moves the blending flesh evenly, by at most MAX_SWELLING. The difference from linear skinning,
-taken back to the rest pose, is fitted to vec(R - I) of that joint over sampled rotations in
-its range, and is zero wherever the joint does not blend.
+the joint's rotation, about the pivot, which keeps its distance. The blending flesh then moves
+along its normals, by at most MAX_SWELLING, to take the hand back to its volume at rest. The
+difference from linear skinning, taken back to the rest pose, is fitted to vec(R - I) of that
+joint over sampled rotations in its range, and is zero wherever the joint does not blend.
 """
 
 from dataclasses import replace

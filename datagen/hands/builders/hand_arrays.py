@@ -12,8 +12,8 @@ from datagen.hands.model import PARENTS
 
 __all__ = [
     "DIGIT_JOINTS",
-    "HandArrays",
     "TIP_ORDER",
+    "HandArrays",
     "descendants",
     "digit_chain",
     "fit_regressor_row",
@@ -23,7 +23,13 @@ __all__ = [
     "smoothstep",
 ]
 
-DIGIT_JOINTS = {"thumb": (13, 14, 15), "index": (1, 2, 3), "middle": (4, 5, 6), "ring": (10, 11, 12), "pinky": (7, 8, 9)}
+DIGIT_JOINTS = {
+    "thumb": (13, 14, 15),
+    "index": (1, 2, 3),
+    "middle": (4, 5, 6),
+    "ring": (10, 11, 12),
+    "pinky": (7, 8, 9),
+}
 TIP_ORDER = ("thumb", "index", "middle", "ring", "pinky")
 
 
@@ -83,7 +89,9 @@ def _border_loop(faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, "loop"]:
     while (following := after[loop[-1]]) != loop[0]:
         loop.append(following)
     if len(loop) != len(after):
-        raise ValueError(f"base hand: expected one open border, found {len(after)} edges but a loop of {len(loop)}")
+        raise ValueError(
+            f"base hand: expected one open border, found {len(after)} edges but a loop of {len(loop)}"
+        )
     return np.array(loop)
 
 
@@ -108,7 +116,11 @@ def fit_regressor_row(
     """Non-negative weights of nearby vertices, summing to one, that give `targets` for every sampled shape."""
     near = np.argsort(np.linalg.norm(samples[0] - targets[0], axis=1), kind="stable")[:n_nearest]
     # Shapes differ from the mean by a few millimetres: fit the mean and the differences, in millimetres.
-    basis = np.concatenate([samples[:1], samples[1:] - samples[:1]])[:, near].transpose(0, 2, 1).reshape(-1, n_nearest)
+    basis = (
+        np.concatenate([samples[:1], samples[1:] - samples[:1]])[:, near]
+        .transpose(0, 2, 1)
+        .reshape(-1, n_nearest)
+    )
     wanted = np.concatenate([targets[:1], targets[1:] - targets[:1]]).reshape(-1)
     heavy = 100.0
     solution, _ = nnls(
@@ -124,7 +136,7 @@ def neighbour_mean(faces: Int[np.ndarray, "face 3"], n_verts: int) -> sparse.csr
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edges = np.unique(np.vstack([edges, edges[:, ::-1]]), axis=0)
     adjacency = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n_verts, n_verts))
-    return sparse.diags(1.0 / np.asarray(adjacency.sum(axis=1)).ravel()) @ adjacency
+    return sparse.csr_matrix(sparse.diags(1.0 / np.asarray(adjacency.sum(axis=1)).ravel()) @ adjacency)
 
 
 def rotate_about(

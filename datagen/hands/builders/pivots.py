@@ -15,7 +15,13 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize
 
 from datagen.hands.builders.anthropometry import SEGMENT_FRACTIONS, hand_length
-from datagen.hands.builders.hand_arrays import DIGIT_JOINTS, TIP_ORDER, HandArrays, digit_chain, fit_regressor_row
+from datagen.hands.builders.hand_arrays import (
+    DIGIT_JOINTS,
+    TIP_ORDER,
+    HandArrays,
+    digit_chain,
+    fit_regressor_row,
+)
 
 __all__ = ["move_pivots"]
 
@@ -62,10 +68,12 @@ def _finger_shifts(hand: HandArrays, finger: str, length: float) -> Float[np.nda
     axis = (pip - mcp) / np.linalg.norm(pip - mcp)
 
     def deviation(x: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
-        chain = np.vstack([hand.joints[0], pip - axis * x[0], pip + axis * x[1], dip + axis * x[2], tip + axis * x[3]])
+        chain = np.vstack(
+            [hand.joints[0], pip - axis * x[0], pip + axis * x[1], dip + axis * x[2], tip + axis * x[3]]
+        )
         return np.linalg.norm(np.diff(chain, axis=0), axis=1) / (length * SEGMENT_FRACTIONS[finger]) - 1.0
 
-    result = minimize(
+    result = minimize(  # type: ignore[call-overload]
         lambda x: 1e6 * (x[1] ** 2 + x[2] ** 2 + 1.5 * x[3] ** 2),
         np.array([0.045, 0.0, 0.0, 0.0]),
         method="SLSQP",
@@ -75,11 +83,15 @@ def _finger_shifts(hand: HandArrays, finger: str, length: float) -> Float[np.nda
         ],
     )
     if not result.success:
-        raise ValueError(f"{finger}: no pivots within {TOLERANCE:.0%} of the published fractions ({result.message})")
+        raise ValueError(
+            f"{finger}: no pivots within {TOLERANCE:.0%} of the published fractions ({result.message})"
+        )
     return result.x
 
 
-def _flesh_shift(hand: HandArrays, finger: str, shifts: Float[np.ndarray, "4"]) -> Float[np.ndarray, "vert 3"]:
+def _flesh_shift(
+    hand: HandArrays, finger: str, shifts: Float[np.ndarray, "4"]
+) -> Float[np.ndarray, "vert 3"]:
     """Displacement of the finger's flesh along its axis, none at the web."""
     mcp, pip, dip, tip = digit_chain(hand, finger)
     axis = (pip - mcp) / np.linalg.norm(pip - mcp)
@@ -91,7 +103,9 @@ def _flesh_shift(hand: HandArrays, finger: str, shifts: Float[np.ndarray, "4"]) 
 
 
 def _finger_targets(
-    joints: Float[np.ndarray, "sample 3 3"], tips: Float[np.ndarray, "sample 3"], shifts: Float[np.ndarray, "4"]
+    joints: Float[np.ndarray, "sample 3 3"],
+    tips: Float[np.ndarray, "sample 3"],
+    shifts: Float[np.ndarray, "4"],
 ) -> tuple[Float[np.ndarray, "sample 3"], ...]:
     """The new pivots for every sampled shape: fixed ratios of the old bones, so linear in the shape."""
     mcp, pip, dip = joints[:, 0], joints[:, 1], joints[:, 2]
@@ -102,7 +116,9 @@ def _finger_targets(
     return new_mcp, new_pip, new_dip
 
 
-def _thumb_targets(old_joints: Float[np.ndarray, "sample 16 3"], length: float) -> Float[np.ndarray, "sample 3"]:
+def _thumb_targets(
+    old_joints: Float[np.ndarray, "sample 16 3"], length: float
+) -> Float[np.ndarray, "sample 3"]:
     """The saddle joint for every sampled shape: on the line from the thumb's MCP through the seed."""
     wrist, mcp = old_joints[:, 0], old_joints[:, 14]
     direction = THUMB_CMC_SEED - mcp[0]

@@ -5,11 +5,18 @@ between two fingers is shared by distance to their bones. All weights of a verte
 """
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
 
-from datagen.hands.builders.hand_arrays import DIGIT_JOINTS, HandArrays, digit_chain, neighbour_mean, smoothstep
+from datagen.hands.builders.hand_arrays import (
+    DIGIT_JOINTS,
+    HandArrays,
+    digit_chain,
+    neighbour_mean,
+    smoothstep,
+)
 
 __all__ = ["blend_weights"]
 
@@ -78,7 +85,7 @@ def _thumb_share(hand: HandArrays) -> Float[np.ndarray, "vert"]:
 def _distance_to_bones(hand: HandArrays, digit: str) -> Float[np.ndarray, "vert"]:
     chain = digit_chain(hand, digit)
     distances = []
-    for start, end in zip(chain[:-1], chain[1:]):
+    for start, end in pairwise(chain):
         bone = end - start
         t = np.clip((hand.v_template - start) @ bone / (bone @ bone), 0.0, 1.0)
         distances.append(np.linalg.norm(hand.v_template - start - t[:, None] * bone, axis=1))

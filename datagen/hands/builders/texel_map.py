@@ -19,7 +19,9 @@ class TexelMap:
     def inside(self) -> Bool[np.ndarray, "row column"]:
         return self.face >= 0
 
-    def sample(self, corner_values: Float[np.ndarray, "face 3 channel"]) -> Float[np.ndarray, "row column channel"]:
+    def sample(
+        self, corner_values: Float[np.ndarray, "face 3 channel"]
+    ) -> Float[np.ndarray, "row column channel"]:
         """Values given on face corners, interpolated to texels (0 outside)."""
         mixed = np.einsum("rck,rckd->rcd", self.barycentric, corner_values[np.maximum(self.face, 0)])
         return np.where(self.inside[..., None], mixed, 0.0)

@@ -1,6 +1,7 @@
 """Closes the wrist with a slightly domed cap of concentric rings."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -64,8 +65,11 @@ def _cap_faces(
     after = np.roll(here, -1)
     rings = [loop, *(n_verts + k * n + here for k in range(len(RINGS)))]
     faces, spokes = [], []
-    for outer, inner in zip(rings[:-1], rings[1:]):
-        faces += [np.stack([outer[after], outer, inner], axis=1), np.stack([outer[after], inner, inner[after]], axis=1)]
+    for outer, inner in pairwise(rings):
+        faces += [
+            np.stack([outer[after], outer, inner], axis=1),
+            np.stack([outer[after], inner, inner[after]], axis=1),
+        ]
         spokes += [np.stack([after, here, here], axis=1), np.stack([after, here, after], axis=1)]
     centre = np.full(n, n_verts + len(RINGS) * n)
     faces.append(np.stack([rings[-1][after], rings[-1], centre], axis=1))

@@ -27,7 +27,7 @@ from datagen.objects.export import mesh_to_glb
 from datagen.objects.gltf import read_gltf
 from datagen.objects.holdable import holdable_scale
 from datagen.objects.library import REFERENCE_READING
-from datagen.objects.mesh import Material, ObjectMesh
+from datagen.objects.mesh import Material
 from datagen.objects.orientation import outward_mesh
 from datagen.objects.pieces import mesh_pieces, sub_mesh
 from datagen.objects.preparation import REFERENCE_PREPARATION, cached_solid, solid_to_bytes
@@ -140,7 +140,7 @@ def shipped_material(material: Material, look: Look) -> Material:
     image = material.base_color_image if look.color is None else None
     return replace(
         material,
-        base_color_rgba=tuple(round(value, 4) for value in color),
+        base_color_rgba=(round(color[0], 4), round(color[1], 4), round(color[2], 4), round(color[3], 4)),
         base_color_image=None if image is None else shipped_image(image),
         roughness=round(material.roughness if look.roughness is None else look.roughness, 3),
         metallic=material.metallic if look.metallic is None else look.metallic,

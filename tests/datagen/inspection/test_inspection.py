@@ -1,5 +1,6 @@
 """Inspection shows what the shard holds: numbers in the table, labels where the masks are."""
 
+import io
 import sys
 from pathlib import Path
 
@@ -31,7 +32,7 @@ def shard(dataset) -> Shard:
 
 
 def test_summary_names_every_clip_object_and_file(shard):
-    console = Console(width=250, record=True, file=open("/dev/null", "w"))
+    console = Console(width=250, record=True, file=io.StringIO())
     console.print(shard_summary(shard))
     text = console.export_text()
     for clip in shard.clips():

@@ -26,7 +26,9 @@ def painted_box(box) -> ObjectMesh:
     """Every field of Material in use, UVs that differ at every corner, three materials."""
     verts, faces = box
     rng = np.random.default_rng(0)
-    glass = Material(name="glass", base_color_rgba=(0.9, 0.95, 1.0, 1.0), roughness=0.0, transmission=1.0, ior=1.5)
+    glass = Material(
+        name="glass", base_color_rgba=(0.9, 0.95, 1.0, 1.0), roughness=0.0, transmission=1.0, ior=1.5
+    )
     painted = Material(
         name="painted",
         base_color_rgba=(1.0, 0.5, 0.25, 1.0),
@@ -72,7 +74,9 @@ def test_materials_survive(painted_box, tmp_path):
 
 
 def test_equal_meshes_give_equal_bytes(painted_box):
-    assert mesh_to_glb(painted_box) == mesh_to_glb(replace(painted_box, verts_obj=painted_box.verts_obj.copy()))
+    assert mesh_to_glb(painted_box) == mesh_to_glb(
+        replace(painted_box, verts_obj=painted_box.verts_obj.copy())
+    )
 
 
 def test_trimesh_reads_the_file_too(painted_box):

@@ -10,7 +10,9 @@ from datagen.objects.occupancy import surface_voxels
 from datagen.objects.solids import closed_surface, signed_distance
 from datagen.objects.texture_quality import TextureQuality
 
-CONFIG = TargetsConfig(surface_points=2048, sdf_near_points=1024, sdf_near_sigma=0.02, sdf_uniform_points=1024)
+CONFIG = TargetsConfig(
+    surface_points=2048, sdf_near_points=1024, sdf_near_sigma=0.02, sdf_uniform_points=1024
+)
 
 
 def make_asset(mesh, surface) -> ObjectAsset:

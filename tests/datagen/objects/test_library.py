@@ -92,7 +92,9 @@ def test_sizes_are_metric_and_fit_a_hand(assets):
             asset.mesh.verts_obj.max(axis=0), -asset.mesh.verts_obj.min(axis=0), atol=1e-6
         )
     by_uid = {asset.uid: asset for asset in assets}
-    np.testing.assert_allclose(np.ptp(by_uid["starter/phone"].mesh.verts_obj, axis=0), [0.058, 0.115, 0.009], atol=1e-4)
+    np.testing.assert_allclose(
+        np.ptp(by_uid["starter/phone"].mesh.verts_obj, axis=0), [0.058, 0.115, 0.009], atol=1e-4
+    )
 
 
 def test_textures_are_kept(assets):
@@ -125,7 +127,9 @@ def test_folder_loads_notes_and_caches(tmp_path, quick):
     folder, cache = tmp_path / "meshes", tmp_path / "cache"
     (folder / "deep").mkdir(parents=True)
     trimesh.creation.box((10, 8, 6)).export(folder / "deep" / "box.stl")
-    (folder / "objects.csv").write_text("path,name,licence,author,url\ndeep/box.stl,Box,CC0-1.0,Ann,http://x\n")
+    (folder / "objects.csv").write_text(
+        "path,name,licence,author,url\ndeep/box.stl,Box,CC0-1.0,Ann,http://x\n"
+    )
     library = MeshFolder(folder, REFERENCE_READING, quick, cache)
     assert library.uids() == ("folder/deep/box.stl",)
     first = library.load("folder/deep/box.stl")

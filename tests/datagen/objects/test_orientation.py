@@ -49,7 +49,9 @@ def test_repeated_triangles_are_dropped(box, plain_mesh):
 
 def test_pieces_of_a_pair(box, plain_mesh):
     verts, faces = box
-    pair = plain_mesh(np.concatenate([verts + [0.2, 0, 0], verts]), np.concatenate([faces, faces + 8]))
+    pair = plain_mesh(
+        np.concatenate([verts + np.array([0.2, 0, 0]), verts]), np.concatenate([faces, faces + 8])
+    )
     piece = mesh_pieces(pair)
     assert sorted(np.unique(piece)) == [0, 1]
     left = sub_mesh(pair, piece == 0)

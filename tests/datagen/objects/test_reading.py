@@ -28,11 +28,15 @@ def png(color=(200, 30, 30), size=(8, 8)) -> bytes:
 def glb(document: dict, binary: bytes = b"") -> bytes:
     text = json.dumps({"asset": {"version": "2.0"}, **document}).encode()
     text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    chunks = (
+        struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    )
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-@pytest.mark.parametrize(("longest", "unit"), [(0.2, "m"), (1.9, "m"), (12.0, "cm"), (99.0, "cm"), (150.0, "mm")])
+@pytest.mark.parametrize(
+    ("longest", "unit"), [(0.2, "m"), (1.9, "m"), (12.0, "cm"), (99.0, "cm"), (150.0, "mm")]
+)
 def test_auto_unit(longest, unit):
     assert unit_of_size(longest) == unit
 
@@ -209,4 +213,6 @@ def test_triangle_of_a_hand_made_glb_is_read(tmp_path):
 def test_export_is_used_by_the_reader(tmp_path, box, plain_mesh):
     path = tmp_path / "a.glb"
     path.write_bytes(mesh_to_glb(plain_mesh(*box)))
-    np.testing.assert_allclose(np.ptp(read_object(path, CONFIG).mesh.verts_obj, axis=0), [0.10, 0.08, 0.06], rtol=1e-6)
+    np.testing.assert_allclose(
+        np.ptp(read_object(path, CONFIG).mesh.verts_obj, axis=0), [0.10, 0.08, 0.06], rtol=1e-6
+    )
