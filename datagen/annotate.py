@@ -34,8 +34,6 @@ __all__ = [
 # Bits of FrameGeometry.masks, as in shards.schema.CONVENTIONS. Arm: forearm and sleeve.
 HAND_VISIBLE, OBJECT_VISIBLE, HAND_AMODAL, OBJECT_AMODAL, ARM_VISIBLE, ARM_AMODAL = 1, 2, 4, 8, 16, 32
 
-TABLE_BAND_ROWS = 24  # temporaries of one band stay in the cache
-
 
 @dataclass(frozen=True, kw_only=True)
 class PartFigures:
@@ -186,22 +184,18 @@ class _Picture:
     def lay_table(self, table: Table, caster: TriangleCaster) -> None:
         """The flat top in closed form, where the camera looks down on it; rays for the rounded border."""
         camera = self.camera
-        window = projected_window(caster.verts, self.T_cam_from_world, camera.K, camera.image_size)
-        for band in window.bands(TABLE_BAND_ROWS):
-            self._lay_table_band(table, caster, band)
-
-    def _lay_table_band(self, table: Table, caster: TriangleCaster, window: PixelWindow) -> None:
         T_world_from_cam = invert_transform(self.T_cam_from_world)
+        window = projected_window(caster.verts, self.T_cam_from_world, camera.K, camera.image_size)
         depth, normals, visible = (
             image[window.slices] for image in (self.depth, self.normals_cam, self.visible)
         )
-        top_depth, y, x = _flat_top_depth(table, T_world_from_cam, self.camera.K, window)
+        top_depth, y, x = _flat_top_depth(table, T_world_from_cam, camera.K, window)
         nearer = top_depth < depth
         depth[nearer] = top_depth[nearer]
         normals[nearer] = self.T_cam_from_world[:3, 2]  # up, seen by the camera
         visible[nearer] = 0
 
-        rays = pixel_rays(self.camera.K, window, y, x)
+        rays = pixel_rays(camera.K, window, y, x)
         hits = caster.cast(T_world_from_cam, rays)
         near = hits.depth < depth[y, x]
         y, x = y[near], x[near]

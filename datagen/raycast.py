@@ -4,7 +4,6 @@ Embree finds the triangle in float32; the depth is then computed again in float6
 triangle's plane. Rays are scaled to z = 1 in the camera, so the ray parameter is the depth.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +18,6 @@ __all__ = ["Hits", "PixelWindow", "TriangleCaster", "cast_window", "pixel_rays",
 # Plane and Embree agree to ~1e-6 of the distance; where they differ by more the ray grazes the
 # triangle's border edge-on, and the plane's value would lie outside the triangle.
 MAX_RELATIVE_DISAGREEMENT = 1e-4
-BATCH = 4096  # rays: temporaries stay in the cache, and below the size that the allocator maps anew
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,11 +38,6 @@ class PixelWindow:
     def slices(self) -> tuple[slice, slice]:
         """Indexes an image (height, width, ...)."""
         return slice(self.y0, self.y1), slice(self.x0, self.x1)
-
-    def bands(self, rows: int) -> Iterator["PixelWindow"]:
-        """The window cut into strips of at most `rows` rows, from the top."""
-        for y0 in range(self.y0, self.y1, rows):
-            yield PixelWindow(x0=self.x0, y0=y0, x1=self.x1, y1=min(y0 + rows, self.y1))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,18 +61,18 @@ class TriangleCaster:
 
     def cast(self, T_mesh_from_cam: Float[np.ndarray, "4 4"], rays_cam: Float[np.ndarray, "ray 3"]) -> Hits:
         """Depth and triangle of the first hit from the camera centre. `rays_cam` have z = 1."""
-        depth = np.full(len(rays_cam), np.inf)
-        triangle = np.full(len(rays_cam), -1, np.int32)
-        origins = np.tile(T_mesh_from_cam[:3, 3].astype(np.float32), (min(BATCH, len(rays_cam)), 1))
-        for start in range(0, len(rays_cam), BATCH):
-            batch = slice(start, start + BATCH)
-            rays = rays_cam[batch] @ T_mesh_from_cam[:3, :3].T
-            found = self._scene.run(origins[: len(rays)], rays.astype(np.float32), output=True)
-            triangle[batch] = found["primID"]
-            hit = np.flatnonzero(found["primID"] >= 0)
-            depth[start + hit] = self._plane_depth(
-                T_mesh_from_cam[:3, 3], rays[hit], found["primID"][hit], found["tfar"][hit].astype(np.float64)
-            )
+        if len(rays_cam) == 0:
+            return Hits(depth=np.zeros(0), triangle=np.zeros(0, np.int32))
+        center = T_mesh_from_cam[:3, 3]
+        rays = rays_cam @ T_mesh_from_cam[:3, :3].T
+        origins = np.tile(center.astype(np.float32), (len(rays), 1))
+        found = self._scene.run(origins, rays.astype(np.float32), output=True)
+        triangle = found["primID"]
+        hit = np.flatnonzero(triangle >= 0)
+        depth = np.full(len(rays), np.inf)
+        depth[hit] = self._plane_depth(
+            center, rays[hit], triangle[hit], found["tfar"][hit].astype(np.float64)
+        )
         return Hits(depth=depth, triangle=triangle)
 
     def _plane_depth(

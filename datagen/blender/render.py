@@ -3,6 +3,7 @@
 import hashlib
 import os
 import resource
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -80,15 +81,21 @@ def render_scene(
         for phase, value in spent.items():
             seconds[phase] += value
         path = str(picture.path.relative_to(frames_dir))
-        progress.send("frame", camera=picture.camera, frame=picture.frame, path=path, seconds=_rounded(spent))
+        progress.send(
+            "frame",
+            camera=picture.camera,
+            frame=picture.frame,
+            path=path,
+            seconds=_rounded(spent),
+            peak_rss_mb=_peak_rss_mb(),
+        )
     clock.close()
     seconds["total"] = time.perf_counter() - started
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     progress.send(
         "done",
         rendered=len(missing),
         skipped=n_pictures - len(missing),
-        peak_rss_mb=round(peak_mb, 1),
+        peak_rss_mb=_peak_rss_mb(),
         cpu_seconds=round(time.process_time(), 3),
         seconds=_rounded(seconds),
         **common,
@@ -179,6 +186,11 @@ class _PhaseClock:
 
     def _on_post(self, *_: Any) -> None:
         self.rendered = time.perf_counter()
+
+
+def _peak_rss_mb() -> float:
+    kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
+    return round(kib / (1024.0**2 if sys.platform == "darwin" else 1024.0), 1)
 
 
 def _rounded(seconds: dict[str, float]) -> dict[str, float]:

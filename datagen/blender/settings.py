@@ -41,6 +41,8 @@ def apply_settings(settings: RenderSettings, device: Device, threads: int) -> No
     view.view_transform = settings.view_transform
     view.look = "AgX - Medium High Contrast" if settings.view_transform == "AgX" else "None"
     view.exposure = settings.exposure_ev
+    for stamp in [name for name in dir(render) if name.startswith("use_stamp")]:
+        setattr(render, stamp, False)  # dates and durations in the files would make equal pictures differ
     render.dither_intensity = 0.0
     render.film_transparent = False
     image = render.image_settings

@@ -52,7 +52,7 @@ def draw_labels(
     ):
         large = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
         contours, _ = cv2.findContours(large, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(canvas, contours, -1, color, thickness, cv2.LINE_AA)
+        cv2.drawContours(canvas, contours, -1, color, thickness)
     _draw_joints(canvas, joints_px * zoom)
     _draw_axes(canvas, T_cam_from_obj, K, axis_length_m, zoom)
     return canvas

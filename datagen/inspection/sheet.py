@@ -65,7 +65,7 @@ def _clip_rows(
     shard: Shard, clip: ClipRow, object_scale_m: float, n_frames: int, tile_px: int
 ) -> UInt8[np.ndarray, "height width 3"]:
     frames = shard.read_frames(clip.clip_id, FRAME_COLUMNS)
-    moments = np.linspace(0, clip.n_frames - 1, n_frames).round().astype(int)
+    moments: list[int] = np.linspace(0, clip.n_frames - 1, n_frames).round().astype(int).tolist()
     zoom = max(1, round(2 * tile_px / clip.image_width))
     plain = [_tile(frames.rgb(i), tile_px) for i in moments]
     labelled = [

@@ -51,7 +51,8 @@ def learning_targets(asset: ObjectAsset, seed: int, config: TargetsConfig) -> Le
     """Occupancy, surface samples and signed distances of one object. Same seed, same bytes."""
     digest = hashlib.sha256(asset.uid.encode()).digest()
     rng = np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
-    low, high = asset.mesh.verts_obj.min(axis=0), asset.mesh.verts_obj.max(axis=0)
+    both = np.concatenate([asset.mesh.verts_obj, asset.solid.verts_obj])  # sheets are thickened in the solid
+    low, high = both.min(axis=0), both.max(axis=0)
     scale_m, center = float((high - low).max()), 0.5 * (low + high)
     verts = (asset.solid.verts_obj - center) / scale_m
     faces = asset.solid.faces

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import igl
@@ -21,6 +22,9 @@ from datagen.annotate import (
     annotate_frame,
     hand_object_distances,
 )
+from datagen.hands.arm import ArmStyle, dress_hand, dressed_verts
+from datagen.hands.model import load_open_hand, pose_hand, shape_hand
+from datagen.hands.skin import decode_skin, load_open_skin, open_nail_mask_png
 from datagen.objects.mesh import Material, ObjectMesh
 from datagen.raycast import TriangleCaster, cast_window, projected_window
 from datagen.scene import (
@@ -108,7 +112,7 @@ def make_scene(
         T_world_from_obj=T,
         hand_surface=HandSurface(
             faces=faces,
-            corner_uv=np.full((len(faces), 3, 2), 0.5),
+            corner_uv=np.tile(np.array([[0.4, 0.4], [0.6, 0.4], [0.5, 0.6]]), (len(faces), 1, 1)),
             face_part=np.where(np.arange(len(faces)) < len(palm.faces), HAND_SKIN, ARM_SKIN),
             n_hand_verts=n_hand,
         ),
@@ -146,6 +150,45 @@ def make_scene(
         render=RenderSettings(samples=1, max_bounces=1, denoise=False, exposure_ev=0.0, view_transform="AgX"),
         seed=3,
     )
+
+
+def make_hand_scene(size: tuple[int, int]) -> tuple[Scene, np.ndarray]:
+    """The open hand with forearm and sleeve over a bumpy ball, and its 21 joints per frame."""
+    scene = make_scene(bumpy_ball(), size=size)
+    hand = shape_hand(load_open_hand(), np.zeros(10))
+    style = ArmStyle(
+        length_m=0.2,
+        girth=1.0,
+        sleeve_start_m=0.06,
+        sleeve_gap_m=0.005,
+        cuff_m=0.03,
+        fold_depth_m=0.002,
+        fold_phase_rad=0.5,
+    )
+    dressed = dress_hand(hand, style)
+    turn = np.array([[1.3, 0.2, 0.1], [1.4, 0.1, 0.2]])
+    at_origin = {"orientation_world": turn, "hand_pose": np.full((2, 45), 0.05), "flat_hand_mean": True}
+    rest = pose_hand(hand, translation_world=np.zeros((2, 3)), **at_origin)
+    beside = np.array([0.04, 0.0, 0.28]) - rest.joints_world[:, 4]
+    posed = pose_hand(hand, translation_world=beside, **at_origin)
+    skins = load_open_skin()
+    scene = replace(
+        scene,
+        hand_surface=HandSurface(
+            faces=dressed.faces,
+            corner_uv=dressed.corner_uv,
+            face_part=dressed.face_part,
+            n_hand_verts=dressed.n_hand_verts,
+        ),
+        hand_verts_world=dressed_verts(dressed, posed),
+        hand_look=replace(
+            scene.hand_look,
+            skin_png=encode_png(decode_skin(skins, np.zeros(skins.basis.shape[1])), level=1),
+            skin_coefficients=np.zeros(skins.basis.shape[1]),
+            nail_mask_png=open_nail_mask_png(),
+        ),
+    )
+    return scene, posed.joints_world
 
 
 def bumpy_ball() -> trimesh.Trimesh:
@@ -346,11 +389,28 @@ def test_annotation_repeats_to_the_last_bit():
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
+def test_joints_project_inside_the_amodal_hand():
+    scene, joints_world = make_hand_scene((320, 240))
+    geometry = MotionGeometry(scene)
+    for frame in range(2):
+        for camera, buffers in zip(scene.cameras, annotate_frame(geometry, frame)):
+            joints_cam = transform_points(camera.T_cam_from_world[frame], joints_world[frame])
+            inside = in_frustum(joints_cam, camera.K, camera.image_size)
+            column, row = np.floor(project_points(joints_cam[inside], camera.K)).astype(int).T
+            # The wrist joint lies in the plane where hand and arm meet; tips lie on the surface.
+            body = (buffers.masks & (HAND_AMODAL | ARM_AMODAL)) > 0
+            near = np.stack([np.roll(body, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]).any(
+                axis=0
+            )
+            assert inside.sum() >= 15
+            assert near[row, column].all()
+
+
 @pytest.mark.blender
 def test_buffers_agree_with_the_passes_of_cycles(tmp_path):
     """Depth within 1e-4 relative for > 99.5 % of pixels, masks with IoU > 0.995."""
     pytest.importorskip("bpy")
-    scene = make_scene(bumpy_ball(), size=(256, 192))
+    scene, _ = make_hand_scene((256, 192))
     save_scene(scene, tmp_path / "scene.npz")
     command = [sys.executable, str(RENDER_SCRIPT), "--scene", str(tmp_path / "scene.npz"), "--passes"]
     command += ["--frames-dir", str(tmp_path), "--threads", "1"]

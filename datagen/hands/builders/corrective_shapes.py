@@ -57,7 +57,7 @@ def _rest_offset(hand: HandArrays, joint: int, rotvec: Float[np.ndarray, "3"]) -
 def _swelling(
     hand: HandArrays, share: Float[np.ndarray, "vert"], verts: Float[np.ndarray, "vert 3"]
 ) -> Float[np.ndarray, "vert 3"]:
-    """Offset of the blending flesh along its normals that takes the volume of `verts` back to that at rest."""
+    """Offset of the blending flesh along its normals that takes `verts` back to the volume at rest."""
     bell = 4.0 * share * (1.0 - share)
     mesh = trimesh.Trimesh(verts, hand.faces, process=False)
     rest_volume = trimesh.Trimesh(hand.v_template, hand.faces, process=False).volume

@@ -1,11 +1,13 @@
-"""The arrays of a hand while it is being built. Rest frame, metres: fingers -x, thumb +z, back of the hand +y."""
+"""The arrays of a hand while it is being built.
+
+Rest frame, metres: fingers to -x, thumb to +z, back of the hand to +y.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import sparse
 from scipy.optimize import nnls
 
 from datagen.hands.model import PARENTS
@@ -113,7 +115,7 @@ def descendants(joint: int) -> list[int]:
 def fit_regressor_row(
     samples: Float[np.ndarray, "sample vert 3"], targets: Float[np.ndarray, "sample 3"], n_nearest: int = 150
 ) -> Float[np.ndarray, "vert"]:
-    """Non-negative weights of nearby vertices, summing to one, that give `targets` for every sampled shape."""
+    """Non-negative weights of nearby vertices, summing to one, that give `targets` for all samples."""
     near = np.argsort(np.linalg.norm(samples[0] - targets[0], axis=1), kind="stable")[:n_nearest]
     # Shapes differ from the mean by a few millimetres: fit the mean and the differences, in millimetres.
     basis = (
@@ -131,12 +133,13 @@ def fit_regressor_row(
     return row
 
 
-def neighbour_mean(faces: Int[np.ndarray, "face 3"], n_verts: int) -> sparse.csr_matrix:
-    """Row-stochastic matrix that replaces each vertex by the mean of its neighbours."""
+def neighbour_mean(faces: Int[np.ndarray, "face 3"], n_verts: int) -> Float[np.ndarray, "vert vert"]:
+    """Matrix that replaces each vertex by the mean of its neighbours."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    edges = np.unique(np.vstack([edges, edges[:, ::-1]]), axis=0)
-    adjacency = sparse.csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n_verts, n_verts))
-    return sparse.csr_matrix(sparse.diags(1.0 / np.asarray(adjacency.sum(axis=1)).ravel()) @ adjacency)
+    edges = np.vstack([edges, edges[:, ::-1]])
+    adjacency = np.zeros((n_verts, n_verts))
+    adjacency[edges[:, 0], edges[:, 1]] = 1.0
+    return adjacency / adjacency.sum(axis=1, keepdims=True)
 
 
 def rotate_about(

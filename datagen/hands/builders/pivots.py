@@ -31,7 +31,7 @@ PIVOT_DEPTHS = (0.36, 0.45, 0.45)  # MCP, PIP, DIP: part of the thickness that l
 DIP_FLESH_FOLLOWS = 0.5
 WEB_BEHIND_PIP = 0.030  # metres; the flesh of the palm stays
 # The saddle joint of the thumb: 15 mm distal of the wrist pivot, radial and a little palmar.
-# Millimetres of freedom are settled by the length of the metacarpal.
+# The length of the metacarpal settles where on the line to it the pivot lies.
 THUMB_CMC_SEED = np.array([-0.0170, -0.0060, 0.0180])
 
 

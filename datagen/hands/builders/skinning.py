@@ -47,7 +47,7 @@ def blend_weights(hand: HandArrays) -> HandArrays:
     to_ring = np.linalg.norm(verts[:, None] - ring, axis=2).min(axis=1)
     weights *= smoothstep(to_ring, 0.0, RING_MARGIN)[:, None]
     weights = _smooth(hand, weights)
-    weights[:, 0] = 1.0 - weights[:, 1:].sum(axis=1)
+    weights[:, 0] = np.maximum(1.0 - weights[:, 1:].sum(axis=1), 0.0)  # rounding may leave -2e-16
     return replace(hand, weights=weights)
 
 
