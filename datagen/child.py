@@ -14,8 +14,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["ChildError", "die_with_parent", "emit", "run_child"]
+__all__ = ["BAD_INPUT", "ChildError", "die_with_parent", "emit", "run_child"]
 
+BAD_INPUT = 2  # exit status of a child that says in one line what the user got wrong
 LOG_LINES_SHOWN = 12
 PR_SET_PDEATHSIG = 1
 
@@ -57,7 +58,8 @@ def run_child(
 ) -> None:
     """Run `command`, hand every JSON line of its output to `on_event`, keep the rest in `log`.
 
-    Raises ChildError with the end of the log when the child exits with a status other than 0.
+    Raises ChildError when the child exits with a status other than 0; its message is the end of the log,
+    one line of it when the status is BAD_INPUT.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as log_file:
@@ -78,15 +80,16 @@ def run_child(
             process.kill()
             process.wait()
             raise
+    if status == BAD_INPUT:
+        raise ChildError(_log_end(log, start, lines=1), status=status, log=log)
     if status != 0:
         ended = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
-        raise ChildError(
-            f"{_log_end(log, start)}\n(child ended {ended}; full log: {log})", status=status, log=log
-        )
+        end = _log_end(log, start, lines=LOG_LINES_SHOWN)
+        raise ChildError(f"{end}\n(child ended {ended}; full log: {log})", status=status, log=log)
 
 
-def _log_end(log: Path, start: int) -> str:
+def _log_end(log: Path, start: int, *, lines: int) -> str:
     with log.open("rb") as file:
         file.seek(start)
-        lines = file.read().decode(errors="replace").strip().splitlines()
-    return "\n".join(lines[-LOG_LINES_SHOWN:]) if lines else "no output"
+        written = file.read().decode(errors="replace").strip().splitlines()
+    return "\n".join(written[-lines:]) if written else "no output"

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from datagen.child import ChildError, run_child
+from datagen.child import BAD_INPUT, ChildError, run_child
 from datagen.config import DatasetConfig, config_as_yaml, config_sha256
 from datagen.library import open_library
 from datagen.plan import PLAN_FILE, Plan, make_plan, read_plan, same_plan, write_plan
@@ -145,10 +145,10 @@ def _run_workers(
     with ThreadPoolExecutor(max_workers=options.workers) as pool:
         errors = [error for error in pool.map(render, motion_indices) if error is not None]
     if errors:
-        raise PipelineError(
-            f"shard {shard}: {len(errors)} of {len(motion_indices)} motions failed; the others are staged and kept. "
-            f"First failure:\n{errors[0]}"
-        )
+        bugs = [error for error in errors if error.status != BAD_INPUT]
+        lines = "\n".join(str(error) for error in bugs or errors)
+        failed = f"{len(errors)} of {len(motion_indices)} motions"
+        raise PipelineError(f"shard {shard}: {failed} failed, the others are staged and kept: {lines}")
 
 
 @contextmanager

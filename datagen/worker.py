@@ -9,18 +9,19 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
 from datagen.annotate import MotionGeometry, annotate_frame, hand_object_distances
-from datagen.child import die_with_parent, emit, run_child
+from datagen.child import BAD_INPUT, ChildError, die_with_parent, emit, run_child
 from datagen.config import DatasetConfig, config_sha256, load_config
 from datagen.grasps.synthesise import synthesise_grasp
 from datagen.hands.model import load_open_hand, shape_hand
 from datagen.hands.skin import load_open_skin
 from datagen.library import open_library
 from datagen.objects.asset import ObjectAsset
+from datagen.objects.errors import ObjectError
 from datagen.objects.fields import learning_targets
 from datagen.pack import RenderRecord, clip_row, encoded_rgb, frame_row, object_row
 from datagen.plan import PLAN_FILE, MotionPlan, read_plan
@@ -31,6 +32,7 @@ from datagen.sampling.streams import Stream, stream_rng
 from datagen.scene_file import save_scene
 from datagen.timing import PhaseTimer
 from datagen.version import generator_commit
+from shards.errors import ShardError
 from shards.records import Provenance
 from shards.schema import ClipRow, FrameRow
 from shards.writer import motion_dir, stage_motion, stage_skipped_motion
@@ -81,7 +83,20 @@ def main(arguments: list[str] | None = None) -> None:
         device=options.device,
         threads=options.threads,
     )
-    run_job(job)
+    try:
+        run_job(job)
+    except (ObjectError, ShardError) as error:
+        _refuse(error)
+    except ChildError as error:
+        if error.status != BAD_INPUT:
+            raise
+        _refuse(error)
+
+
+def _refuse(error: Exception) -> NoReturn:
+    """What a user can cause ends as one line; anything else is a bug and keeps its trace."""
+    sys.stderr.write(f"{error}\n")
+    sys.exit(BAD_INPUT)
 
 
 def run_job(job: Job) -> None:

@@ -47,7 +47,8 @@ def add_image(data: bytes, what: str, *, is_color: bool) -> bpy.types.Image:
     image.alpha_mode = "CHANNEL_PACKED"
     if tuple(image.size) != decoded.size:
         raise TextureError(
-            f"{what}: Blender reads {tuple(image.size)} pixels of {decoded.size}; save it as PNG"
+            f"{what}: not a readable image (Blender reads {tuple(image.size)} pixels of {decoded.size}); "
+            "replace the file"
         )
     return image
 

@@ -14,6 +14,7 @@ import bpy
 from datagen.blender.build import BuiltScene, build_scene, show_frame, use_camera
 from datagen.blender.devices import DeviceRequest, select_device
 from datagen.blender.log import BlenderLog, Progress, RenderError
+from datagen.blender.png import finish_picture
 from datagen.blender.settings import apply_settings, sampling_seed
 from datagen.scene import Scene
 from datagen.scene_file import scene_sha256
@@ -21,7 +22,6 @@ from datagen.scene_file import scene_sha256
 __all__ = ["Picture", "frame_path", "render_scene", "resume_key"]
 
 _KEY_FILE = "pictures.sha256"
-_PNG_START, _PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -146,22 +146,13 @@ def _render_picture(
         bpy.ops.render.render(write_still=True)
     except RuntimeError as error:
         raise RenderError(f"camera {picture.camera}, frame {picture.frame}: {error}") from error
-    finished = time.perf_counter()
     log.check(f"camera {picture.camera}, frame {picture.frame}")
-    _check_png(partial)
-    os.replace(partial, picture.path)
+    finish_picture(partial, picture.path)
     return {
         "sync": clock.first_sample - started,
         "render": clock.rendered - clock.first_sample,
-        "write": finished - clock.rendered + (time.perf_counter() - finished),
+        "write": time.perf_counter() - clock.rendered,
     }
-
-
-def _check_png(path: Path) -> None:
-    """A disk that filled up leaves a file that stops early."""
-    data = path.read_bytes() if path.is_file() else b""
-    if not (data.startswith(_PNG_START) and data.endswith(_PNG_END)):
-        raise RenderError(f"{path}: Blender wrote no complete picture; is the disk full?")
 
 
 class _PhaseClock:

@@ -123,6 +123,40 @@ def test_a_missing_gpu_is_one_line_and_exit_status_2(config, tmp_path):
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 2
     assert "optix" in result.output.lower()
+    assert "Traceback" not in result.output
+
+
+def nan_mesh(path: Path) -> None:
+    mesh = trimesh.creation.box((0.05, 0.05, 0.1))
+    mesh.vertices[0] = np.nan
+    path.write_bytes(trimesh.exchange.ply.export_ply(mesh))
+
+
+def flat_mesh(path: Path) -> None:
+    trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], [[0, 1, 2]], process=False).export(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        ("empty.ply", lambda path: path.write_bytes(b"")),
+        ("text.obj", lambda path: path.write_text("this is no mesh\n")),
+        ("nan.ply", nan_mesh),
+        ("flat.ply", flat_mesh),
+    ],
+)
+def test_a_bad_object_is_one_line_and_the_other_motion_is_kept(name, write, tmp_path):
+    config = small_config(tmp_path)
+    (tmp_path / "meshes" / "can.ply").unlink()
+    write(tmp_path / "meshes" / name)
+    out = tmp_path / "out"
+    run = subprocess.run(render_command(config, out), cwd=ROOT, capture_output=True, text=True)
+    message = [line for line in run.stderr.splitlines() if line.startswith("datagen:")]
+    assert run.returncode == 2, run.stderr
+    assert len(message) == 1
+    assert name in message[0]
+    assert "Traceback" not in run.stderr
+    assert len(list(out.glob("staging/shard-00000/motion-*/motion.json"))) == 1
 
 
 @pytest.mark.slow

@@ -89,7 +89,7 @@ def rendering():
 
 
 @pytest.fixture(scope="session")
-def _png():
+def png():
     """Make a small PNG of one colour."""
     return _png
 
@@ -130,7 +130,7 @@ def _box_scene() -> Scene:
     T_world_from_obj[:, :3, :3] = turn
     T_world_from_obj[1, :3, 3] = [0.03, -0.02, 0.05]
     hand, surface = _hand()
-    hand_verts_world = np.stack([hand, hand + [0.03, -0.02, 0.05]])
+    hand_verts_world = np.stack([hand, hand + np.array([0.03, -0.02, 0.05])])
     cameras = tuple(
         CameraPath(
             kind="orbit",
@@ -220,7 +220,7 @@ def _emissive_scene(scene: Scene) -> Scene:
     return dataclasses.replace(
         scene,
         object_mesh=dataclasses.replace(scene.object_mesh, materials=(glow,)),
-        hand_verts_world=scene.hand_verts_world + [0.0, 0.0, -50.0],
+        hand_verts_world=scene.hand_verts_world + np.array([0.0, 0.0, -50.0]),
         lights=(),
         background=Background(hdri="studio", rotation_rad=0.0, strength=0.0),
         table=None,

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from datagen.blender.axes import blender_lens, world_from_blender_camera
-from datagen.table_mesh import inside_flat_top, table_mesh
+from datagen.table_mesh import inside_flat_top, table_from_world
 from shards.geometry import (
     invert_transform,
     look_at,
@@ -54,7 +54,9 @@ def test_every_pixel_centre_unprojects_onto_the_surface_it_shows(passes, box_sce
         # On a box the largest coordinate, in half sides, is 1: true for z-depth, false for distance.
         np.testing.assert_allclose(np.max(np.abs(points_obj) / OBJECT_HALF_M, axis=1), 1.0, atol=1e-3)
         on_table = points_world[index == TABLE]
-        above = on_table[inside_flat_top(table_mesh(scene.table), on_table[:, :2]) & (on_table[:, 2] > -0.09)]
+        on_table_xy = transform_points(table_from_world(scene.table), on_table)
+        flat = inside_flat_top(scene.table, on_table_xy[:, 0], on_table_xy[:, 1])
+        above = on_table[flat & (on_table[:, 2] > scene.table.top_z_m - 0.01)]
         assert len(above) > 300
         np.testing.assert_allclose(above[:, 2], scene.table.top_z_m, atol=2e-5)
         offset = scene.hand_verts_world[frame, 0, 2] - scene.hand_verts_world[0, 0, 2]
