@@ -3,13 +3,14 @@
 import bpy
 
 from datagen.blender.images import add_image
-from datagen.blender.nodes import Graph, Input, new_material, surface
+from datagen.blender.nodes import Graph, Input, new_material, replace_surface, surface
 from datagen.objects.mesh import Material
 
 __all__ = ["object_material"]
 
 # Handled things are never equally glossy all over: smudges change roughness by about this much.
 _SMUDGE = 0.12
+_UNBENT = 0.85  # of the light; the rest stays as the faint shadow that glass has
 
 
 def object_material(material: Material) -> bpy.types.Material:
@@ -32,8 +33,23 @@ def object_material(material: Material) -> bpy.types.Material:
     if any(material.emissive_rgb):
         inputs["Emission Color"] = _emission(graph, material)
         inputs["Emission Strength"] = 1.0
-    surface(graph, inputs)
+    shader = surface(graph, inputs)
+    if material.transmission > 0.0:
+        _let_light_through(graph, shader, material)
     return drawn
+
+
+def _let_light_through(graph: Graph, shader: bpy.types.NodeSocket, material: Material) -> None:
+    """Shadow and diffuse rays pass glass unbent.
+
+    Without caustics, which would take thousands of samples, glass would cast the shadow of a
+    stone and what stands inside it would be black.
+    """
+    path = graph.node("ShaderNodeLightPath", {}).outputs
+    unbent = graph.math("MAXIMUM", path["Is Shadow Ray"], path["Is Diffuse Ray"])
+    tint = graph.node("ShaderNodeBsdfTransparent", {"Color": material.base_color_rgba[:3]}).outputs[0]
+    share = graph.math("MULTIPLY", unbent, _UNBENT * material.transmission)
+    replace_surface(graph, graph.node("ShaderNodeMixShader", {0: share, 1: shader, 2: tint}).outputs[0])
 
 
 def _base_color(graph: Graph, material: Material) -> Input:

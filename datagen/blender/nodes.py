@@ -4,10 +4,12 @@ from typing import Any
 
 import bpy
 
-__all__ = ["Graph", "Input", "new_material", "surface"]
+__all__ = ["Graph", "Input", "new_material", "replace_surface", "surface"]
 
 # A number, a colour or vector, or the output of another node.
 Input = float | tuple[float, ...] | bpy.types.NodeSocket
+
+_OUTPUT = "surface output"
 
 
 class Graph:
@@ -102,8 +104,13 @@ def new_material(name: str) -> tuple[bpy.types.Material, Graph]:
     return material, Graph(material.node_tree)
 
 
-def surface(graph: Graph, inputs: dict[str | int, Input], **settings: Any) -> bpy.types.Node:
+def surface(graph: Graph, inputs: dict[str | int, Input], **settings: Any) -> bpy.types.NodeSocket:
     """Principled BSDF with `inputs`, connected to the material's output."""
-    principled = graph.node("ShaderNodeBsdfPrincipled", inputs, **settings)
-    graph.node("ShaderNodeOutputMaterial", {"Surface": principled.outputs[0]})
-    return principled
+    shader = graph.node("ShaderNodeBsdfPrincipled", inputs, **settings).outputs[0]
+    graph.node("ShaderNodeOutputMaterial", {"Surface": shader}, name=_OUTPUT)
+    return shader
+
+
+def replace_surface(graph: Graph, shader: bpy.types.NodeSocket) -> None:
+    """Connect another shader to the output that `surface` made."""
+    graph.tree.links.new(shader, graph.tree.nodes[_OUTPUT].inputs["Surface"])

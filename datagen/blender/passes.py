@@ -27,7 +27,7 @@ def render_passes(
 ) -> None:
     """One sample per pixel, at the pixel's centre, for every camera and frame. CPU only."""
     built = build_scene(scene)
-    apply_settings(scene.render, select_device("cpu"), threads)
+    apply_settings(scene, select_device("cpu"), threads)
     _one_sample_at_centres()
     for frame in range(len(scene.T_world_from_obj)):
         show_frame(built, frame)

@@ -59,7 +59,7 @@ def render_scene(
     n_pictures = len(scene.cameras) * len(scene.T_world_from_obj)
     built = build_scene(scene)
     used = select_device(device)
-    apply_settings(scene.render, used, threads)
+    apply_settings(scene, used, threads)
     log.check("build")
     seconds = {"build": time.perf_counter() - started, "sync": 0.0, "render": 0.0, "write": 0.0}
     common = {"device": used.backend, "device_names": used.names, "bpy_version": bpy.app.version_string}

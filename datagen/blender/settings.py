@@ -5,26 +5,31 @@ import hashlib
 import bpy
 
 from datagen.blender.devices import Device
-from datagen.scene import RenderSettings
+from datagen.scene import Scene
 
 __all__ = ["apply_settings", "sampling_seed"]
 
+_GLASS_BOUNCES = 10  # into and out of four walls, and on to what is behind
 
-def apply_settings(settings: RenderSettings, device: Device, threads: int) -> None:
-    """Set up Cycles and the film for 8-bit sRGB PNG files; `threads` 0 takes every core."""
-    scene = bpy.context.scene
-    render, cycles, view = scene.render, scene.cycles, scene.view_settings
+
+def apply_settings(scene: Scene, device: Device, threads: int) -> None:
+    """Set up Cycles and the film for 8-bit sRGB PNG files; `threads` 0 takes every core.
+
+    Paths through a transmissive object may be longer than `max_bounces`.
+    """
+    settings, has_glass = scene.render, any(m.transmission > 0.0 for m in scene.object_mesh.materials)
+    blender = bpy.context.scene
+    render, cycles, view = blender.render, blender.cycles, blender.view_settings
     render.engine = "CYCLES"
     render.threads_mode, render.threads = ("FIXED", threads) if threads else ("AUTO", 1)
     render.use_persistent_data = True  # keep textures and the BVH of whatever did not change
 
     cycles.samples = settings.samples
     cycles.use_adaptive_sampling = False
-    cycles.max_bounces = settings.max_bounces
-    cycles.diffuse_bounces = min(settings.max_bounces, 3)
-    cycles.glossy_bounces = min(settings.max_bounces, 3)
-    cycles.transmission_bounces = max(settings.max_bounces, 6)  # a glass has four walls
-    cycles.transparent_max_bounces = 4
+    cycles.diffuse_bounces = cycles.glossy_bounces = settings.max_bounces
+    cycles.transmission_bounces = _GLASS_BOUNCES if has_glass else settings.max_bounces
+    cycles.max_bounces = max(settings.max_bounces, cycles.transmission_bounces)
+    cycles.transparent_max_bounces = _GLASS_BOUNCES
     cycles.caustics_reflective = cycles.caustics_refractive = False
     cycles.blur_glossy = 0.5
     cycles.sample_clamp_direct, cycles.sample_clamp_indirect = 0.0, 4.0

@@ -12,7 +12,7 @@ __all__ = ["SkinRelief", "skin_relief", "texel_size_m"]
 
 # Depth of the relief in metres at HandLook.bump = 1.
 _CREASE_M = 0.0011  # per unit of painted brightness: painted creases and knuckles become relief
-_LINE_M = 0.00006
+_LINE_M = 0.000045
 _PORE_M = 0.00003
 _CREASE_WIDTH_M = 0.004  # what is broader is shading or colour, not relief
 

@@ -20,7 +20,7 @@ def open_in_window(scene: Scene) -> None:
     a handler, not stored as keyframes.
     """
     built = build_scene(scene)
-    apply_settings(scene.render, select_device("auto"), 0)
+    apply_settings(scene, select_device("auto"), 0)
     n_frames = len(scene.T_world_from_obj)
     timeline = bpy.context.scene
     timeline.frame_start, timeline.frame_end = 0, n_frames * len(scene.cameras) - 1
