@@ -16,6 +16,7 @@ from datagen.raycast import PixelWindow, TriangleCaster, cast_window, pixel_rays
 from datagen.scene import HAND_SKIN, CameraPath, HandSurface, Scene, Table
 from datagen.table_mesh import inside_flat_top, table_from_world, table_mesh
 from shards.geometry import invert_transform, transform_points
+from shards.images import MASK_BITS, mask_box_px
 
 __all__ = [
     "ARM_AMODAL",
@@ -31,8 +32,10 @@ __all__ = [
     "hand_object_distances",
 ]
 
-# Bits of FrameGeometry.masks, as in shards.schema.CONVENTIONS. Arm: forearm and sleeve.
-HAND_VISIBLE, OBJECT_VISIBLE, HAND_AMODAL, OBJECT_AMODAL, ARM_VISIBLE, ARM_AMODAL = 1, 2, 4, 8, 16, 32
+# Bits of FrameGeometry.masks are those of the shard format. Arm: forearm and sleeve.
+HAND_VISIBLE, HAND_AMODAL = MASK_BITS["hand_visible"], MASK_BITS["hand_amodal"]
+OBJECT_VISIBLE, OBJECT_AMODAL = MASK_BITS["object_visible"], MASK_BITS["object_amodal"]
+ARM_VISIBLE, ARM_AMODAL = MASK_BITS["arm_visible"], MASK_BITS["arm_amodal"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -275,9 +278,6 @@ def _ray_component(
 
 
 def _box(mask: Bool[np.ndarray, "height width"], window: PixelWindow) -> Int[np.ndarray, "4"]:
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    if len(columns) == 0:
-        return np.full(4, -1)
-    return np.array(
-        [window.x0 + columns[0], window.y0 + rows[0], window.x0 + columns[-1] + 1, window.y0 + rows[-1] + 1]
-    )
+    """`mask_box_px` of a window of the picture, in pixels of the picture."""
+    box = np.array(mask_box_px(mask))
+    return box if box[0] < 0 else box + np.array([window.x0, window.y0, window.x0, window.y0])

@@ -17,10 +17,12 @@ from datagen.objects.fields import TargetsConfig
 from datagen.pack import ShardConfig
 from datagen.plan import PlanConfig
 from datagen.sampling.config import SamplingConfig
+from datagen.version import generator_commit
+from shards.records import Provenance
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
 
-__all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config"]
+__all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config", "provenance_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,3 +65,8 @@ def config_sha256(config: DatasetConfig) -> str:
     """Changes when any setting that decides the data changes; where assets and caches lie does not."""
     placeless = replace(config, objects=replace(config.objects, path=None, cache_dir=None))
     return hashlib.sha256(config_as_yaml(placeless).encode()).hexdigest()
+
+
+def provenance_of(config: DatasetConfig) -> Provenance:
+    """What made the data: this code and this configuration."""
+    return Provenance(generator_commit=generator_commit(), config_sha256=config_sha256(config))

@@ -17,15 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from datagen.child import BAD_INPUT, ChildError, run_child
-from datagen.config import DatasetConfig, config_as_yaml, config_sha256
+from datagen.config import DatasetConfig, config_as_yaml, provenance_of
 from datagen.library import open_library
 from datagen.plan import PLAN_FILE, Plan, make_plan, read_plan, same_plan, write_plan
-from datagen.version import generator_commit
-from shards.records import DatasetRecord, Provenance, ShardRecord
+from shards.records import DatasetRecord, ShardRecord
 from shards.schema import CONVENTIONS, SCHEMA_VERSION
 from shards.writer import begin_dataset, commit_shard, is_motion_staged, is_shard_committed
 
-__all__ = ["PipelineError", "Progress", "RenderOptions", "plan_dataset", "provenance_of", "render_shard"]
+__all__ = ["PipelineError", "Progress", "RenderOptions", "plan_dataset", "render_shard"]
 
 
 class PipelineError(RuntimeError):
@@ -49,11 +48,6 @@ class Progress:
     phase: str  # staged, grasp, scene, render, annotate, done, skipped
     done: int
     total: int
-
-
-def provenance_of(config: DatasetConfig) -> Provenance:
-    """What made the data: this code and this configuration."""
-    return Provenance(generator_commit=generator_commit(), config_sha256=config_sha256(config))
 
 
 def plan_dataset(config: DatasetConfig, out: Path) -> Plan:

@@ -15,7 +15,7 @@ import numpy as np
 
 from datagen.annotate import MotionGeometry, annotate_frame, hand_object_distances
 from datagen.child import BAD_INPUT, ChildError, die_with_parent, emit, run_child
-from datagen.config import DatasetConfig, config_sha256, load_config
+from datagen.config import DatasetConfig, load_config, provenance_of
 from datagen.grasps.synthesise import synthesise_grasp
 from datagen.hands.model import load_open_hand, shape_hand
 from datagen.hands.skin import load_open_skin
@@ -31,7 +31,6 @@ from datagen.sampling.motion import SampledMotion, sample_scene
 from datagen.sampling.streams import Stream, stream_rng
 from datagen.scene_file import save_scene
 from datagen.timing import PhaseTimer
-from datagen.version import generator_commit
 from shards.errors import ShardError
 from shards.records import Provenance
 from shards.schema import ClipRow, FrameRow
@@ -59,7 +58,7 @@ class Job:
 
     @property
     def provenance(self) -> Provenance:
-        return Provenance(generator_commit=generator_commit(), config_sha256=config_sha256(self.config))
+        return provenance_of(self.config)
 
 
 class NoGraspError(ValueError):
