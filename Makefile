@@ -9,6 +9,13 @@ DATA   ?= data/tiny
 PYTHON ?= python3.11
 ARGS   ?=
 
+# Where licensed inputs lie (`datagen assets` lists them); a configuration may name the places instead.
+GRASPXL   ?=
+OBJAVERSE ?=
+MANO_DIR  ?=
+HTML_DIR  ?=
+export GRASPXL OBJAVERSE MANO_DIR HTML_DIR
+
 VENV    := .venv
 PIP     := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 RUNTIME := $(VENV)/.runtime-installed
@@ -20,6 +27,7 @@ help: ## list the targets and their variables
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
 	@echo
 	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) ARGS=$(ARGS) PYTHON=$(PYTHON)"
+	@echo "places of licensed inputs: GRASPXL=$(GRASPXL) OBJAVERSE=$(OBJAVERSE) MANO_DIR=$(MANO_DIR) HTML_DIR=$(HTML_DIR)"
 
 $(VENV)/bin/python:
 	@command -v $(PYTHON) >/dev/null || { echo "make: $(PYTHON) not found. Blender's module needs Python 3.11: install it, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11"; exit 2; }

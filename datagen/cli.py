@@ -2,68 +2,36 @@
 
 import functools
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import click
-import numpy as np
 from rich.console import Console
 from rich.progress import Progress, TaskID
 
+from datagen.cli_inputs import assets, grasps, select
+from datagen.cli_options import (
+    config_option,
+    default_out,
+    license_option,
+    out_option,
+    plain_errors,
+    workers_option,
+)
 from datagen.config import load_config
-from datagen.grasps.report import summarise
-from datagen.grasps.synthesise import synthesise_grasp
-from datagen.hands.model import load_open_hand, shape_hand
-from datagen.inspection.grasp_table import grasp_table
 from datagen.inspection.plan_table import plan_table
+from datagen.inspection.selection_table import selection_line
 from datagen.inspection.sheet import contact_sheet, write_png
 from datagen.inspection.summary import shard_line, shard_summary
 from datagen.inspection.video import write_video
-from datagen.library import open_library
-from datagen.objects.errors import ObjectError
-from datagen.pipeline import PipelineError, RenderOptions, plan_dataset, render_shard
-from datagen.plan import PlanError
+from datagen.pipeline import RenderOptions, plan_dataset, render_shard
 from datagen.render_progress import RenderProgress
-from datagen.sampling.streams import Stream, stream_rng
+from datagen.selection_progress import SelectionProgress
 from shards.errors import ShardError
 from shards.reader import Shard, open_dataset, open_shard
-from shards.settings import SettingsError
 from shards.verify import ShardReport, verify_shard
 
 __all__ = ["main"]
-
-USER_ERRORS = (SettingsError, PlanError, PipelineError, ObjectError, ShardError)
-DEFAULT_CONFIG = Path("configs/datagen/tiny.yaml")
-
-config_option = click.option(
-    "--config",
-    "config_path",
-    type=click.Path(path_type=Path, dir_okay=False),
-    default=DEFAULT_CONFIG,
-    show_default=True,
-    help="Complete YAML configuration.",
-)
-out_option = click.option(
-    "--out",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=None,
-    help="Dataset folder.  [default: data/<name of the configuration>]",
-)
-
-
-def plain_errors(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What a user can cause ends as one clear message and exit status 2; the rest is a bug and shows a trace."""
-
-    @functools.wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        try:
-            return command(*args, **kwargs)
-        except USER_ERRORS as error:
-            click.echo(f"datagen: {error}", err=True)
-            sys.exit(2)
-
-    return wrapped
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -78,20 +46,28 @@ def main() -> None:
     """
 
 
+for command in (select, grasps, assets):
+    main.add_command(command)
+
+
 @main.command()
 @config_option
 @out_option
+@license_option
+@workers_option
 @plain_errors
-def plan(config_path: Path, out: Path | None) -> None:
-    """Decide what to render: write dataset.json and plan.parquet.
+def plan(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
+    """Decide what to render: write dataset.json, selection.parquet and plan.parquet.
 
     \b
     Example:
       datagen plan --config configs/datagen/paper.yaml --out data/paper
     """
-    config = load_config(config_path)
+    config = load_config(config_path, licence_allow=licence_allow)
     out = out or default_out(config_path)
-    made = plan_dataset(config, out)
+    with SelectionProgress() as bar:
+        made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
+    click.echo(selection_line(selection.decisions))
     Console().print(plan_table(made, out))
 
 
@@ -110,9 +86,16 @@ def plan(config_path: Path, out: Path | None) -> None:
     "--workers", type=click.IntRange(min=1), default=1, show_default=True, help="Motions at a time."
 )
 @click.option("--threads", type=click.IntRange(min=1), default=None, help="Render threads of each worker.")
+@license_option
 @plain_errors
 def render(
-    config_path: Path, out: Path | None, shard: int, device: str, workers: int, threads: int | None
+    config_path: Path,
+    out: Path | None,
+    shard: int,
+    device: str,
+    workers: int,
+    threads: int | None,
+    licence_allow: tuple[str, ...] | None,
 ) -> None:
     """Render one shard, or what is missing of it, and verify it.
 
@@ -120,10 +103,14 @@ def render(
     Example:
       datagen render --config configs/datagen/tiny.yaml --shard 0
     """
-    config = load_config(config_path)
+    config = load_config(config_path, licence_allow=licence_allow)
     out = out or default_out(config_path)
-    made = plan_dataset(config, out)
-    options = RenderOptions(device=device, workers=workers, threads_per_worker=threads)
+    with SelectionProgress() as bar:
+        made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
+    click.echo(selection_line(selection.decisions))
+    options = RenderOptions(
+        device=device, workers=workers, threads_per_worker=threads, licence_allow=licence_allow
+    )
     with RenderProgress(made.shard(shard)) as progress:
         record = render_shard(config_path, config, made, out, shard, options, progress.update)
     click.echo(shard_line(record, out))
@@ -208,45 +195,6 @@ def verify(path: Path) -> None:
             click.echo(f"  {finding}")
         bad += not report.ok
     sys.exit(1 if bad else 0)
-
-
-@main.command()
-@config_option
-@click.option(
-    "--object", "objects", multiple=True, help="Only this object (may be repeated).  [default: all]"
-)
-@click.option(
-    "--motions", type=click.IntRange(min=1), default=1, show_default=True, help="Motions per object."
-)
-@plain_errors
-def grasps(config_path: Path, objects: tuple[str, ...], motions: int) -> None:
-    """Simulate grasps without rendering; print success and quality per object.
-
-    \b
-    Example:
-      datagen grasps --object starter/milk --motions 3
-    """
-    config = load_config(config_path)
-    library = open_library(config.objects)
-    uids = objects or tuple(uid for uid in library.uids() if uid not in config.objects.exclude)
-    hand = shape_hand(load_open_hand(), np.zeros(config.sampling.appearance.n_betas))
-    console = Console(stderr=True)
-    reports = []
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("", total=len(uids) * motions)
-        for number, uid in enumerate(uids):
-            asset = library.load(uid)
-            for motion in range(motions):
-                bar.update(task, description=uid)
-                rng = stream_rng(config.seed, number, Stream.GRASP, 1 + motion)
-                reports.append(synthesise_grasp(hand, asset, config.grasp, rng))
-                bar.advance(task)
-    Console().print(grasp_table(summarise(reports)))
-
-
-def default_out(config_path: Path) -> Path:
-    """Where the Makefile puts it too."""
-    return Path("data") / config_path.stem
 
 
 def _open(shard: str, out: Path) -> Shard:

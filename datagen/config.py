@@ -12,11 +12,14 @@ from pathlib import Path
 import yaml
 
 from datagen.grasps.config import GraspConfig
+from datagen.hand_source import HandConfig, resolved_hand
 from datagen.library import ObjectsConfig
+from datagen.motion_source import MotionsConfig
 from datagen.objects.fields import TargetsConfig
 from datagen.pack import ShardConfig
 from datagen.plan import PlanConfig
 from datagen.sampling.config import SamplingConfig
+from datagen.selection import SelectionConfig
 from datagen.version import generator_commit
 from shards.records import Provenance
 from shards.settings import SettingsError, settings_from_dict
@@ -32,6 +35,9 @@ class DatasetConfig:
     name: str
     seed: int
     objects: ObjectsConfig
+    motions: MotionsConfig
+    selection: SelectionConfig
+    hand: HandConfig
     plan: PlanConfig
     split: SplitRule
     grasp: GraspConfig
@@ -39,9 +45,21 @@ class DatasetConfig:
     targets: TargetsConfig
     shard: ShardConfig
 
+    def __post_init__(self) -> None:
+        recorded = self.motions.source == "graspxl"
+        if recorded != (self.objects.source == "graspxl"):
+            raise ValueError(
+                f"motions.source is {self.motions.source} with objects.source {self.objects.source}: "
+                "recorded motions need the objects they were recorded with; expected graspxl for both or neither"
+            )
 
-def load_config(path: Path) -> DatasetConfig:
-    """Read a complete YAML file; SettingsError names file, key, expected and found."""
+
+def load_config(path: Path, *, licence_allow: tuple[str, ...] | None = None) -> DatasetConfig:
+    """Read a complete YAML file; SettingsError names file, key, expected and found.
+
+    `auto` settings are decided here, by what is on this machine, so that the configuration names
+    what is really used. `licence_allow` takes the place of selection.licence_allow.
+    """
     try:
         data = yaml.safe_load(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
@@ -52,7 +70,13 @@ def load_config(path: Path) -> DatasetConfig:
         raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
         raise SettingsError(f"{path}: expected a mapping of settings, found {type(data).__name__}")
-    return settings_from_dict(DatasetConfig, data, where=str(path))
+    config = settings_from_dict(DatasetConfig, data, where=str(path))
+    selection = config.selection
+    if selection.takedown is not None:
+        selection = replace(selection, takedown=path.parent / selection.takedown)
+    if licence_allow is not None:
+        selection = replace(selection, licence_allow=licence_allow)
+    return replace(config, hand=resolved_hand(config.hand), selection=selection)
 
 
 def config_as_yaml(config: DatasetConfig) -> str:
@@ -63,7 +87,13 @@ def config_as_yaml(config: DatasetConfig) -> str:
 
 def config_sha256(config: DatasetConfig) -> str:
     """Changes when any setting that decides the data changes; where assets and caches lie does not."""
-    placeless = replace(config, objects=replace(config.objects, path=None, cache_dir=None))
+    placeless = replace(
+        config,
+        objects=replace(config.objects, path=None, cache_dir=None, objaverse_root=None),
+        motions=replace(config.motions, graspxl_root=None),
+        selection=replace(config.selection, takedown=None),
+        hand=replace(config.hand, mano_dir=None, html_dir=None),
+    )
     return hashlib.sha256(config_as_yaml(placeless).encode()).hexdigest()
 
 

@@ -4,9 +4,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from datagen.motion_source import MotionsConfig, graspxl_root
+from datagen.objects.graspxl_objects import GraspXLObjects
 from datagen.objects.library import MeshFolder, ObjectLibrary, StarterPack, Sweethome3D
+from datagen.objects.objaverse import ObjaverseStore, objaverse_root
 from datagen.objects.preparation import PreparationConfig
 from datagen.objects.reading import ReadingConfig
+from datagen.objects.registration import RegistrationConfig
 
 __all__ = ["ObjectsConfig", "open_library"]
 
@@ -17,19 +21,43 @@ DEFAULT_CACHE = Path("~/.cache/forehoi/objects")
 class ObjectsConfig:
     """Where the objects come from."""
 
-    source: Literal["starter", "folder", "sweethome3d"]
+    source: Literal["starter", "folder", "sweethome3d", "objaverse", "graspxl"]
     path: Path | None  # folder of meshes, or root of an unpacked Debian package; null: the default place
-    reading: ReadingConfig  # folder only
-    preparation: PreparationConfig  # folder and sweethome3d; the starter pack is prepared
+    objaverse_root: Path | None  # store of the objaverse package; null: $OBJAVERSE, else its default place
+    textures: Literal["none", "when_present", "required"]  # graspxl: drawn with the originals of the store
+    registration: RegistrationConfig  # graspxl: how an original is matched onto the recorded mesh
+    reading: ReadingConfig  # folder, objaverse and graspxl
+    preparation: PreparationConfig  # all but the starter pack, which is prepared
     cache_dir: Path | None  # solids and convex parts; null: ~/.cache/forehoi/objects
     exclude: tuple[str, ...]  # uids that are left out
 
 
-def open_library(config: ObjectsConfig) -> ObjectLibrary:
-    """The library that `config` names. Raises ObjectError when it is not there."""
+def open_library(config: ObjectsConfig, motions: MotionsConfig) -> ObjectLibrary:
+    """The library that `config` names. Raises ObjectError or InputError when it is not there."""
     cache_dir = (config.cache_dir or DEFAULT_CACHE).expanduser()
     if config.source == "starter":
         return StarterPack()
     if config.source == "folder":
         return MeshFolder(config.path or Path(), config.reading, config.preparation, cache_dir)
-    return Sweethome3D(config.path, config.preparation, cache_dir)
+    if config.source == "sweethome3d":
+        return Sweethome3D(config.path, config.preparation, cache_dir)
+    if config.source == "objaverse":
+        return ObjaverseStore(config.objaverse_root, config.reading, config.preparation, cache_dir)
+    return _graspxl(config, motions, cache_dir)
+
+
+def _graspxl(config: ObjectsConfig, motions: MotionsConfig, cache_dir: Path) -> GraspXLObjects:
+    store = None
+    if config.textures != "none" and (
+        config.textures == "required" or (objaverse_root(config.objaverse_root) / "glbs").is_dir()
+    ):
+        store = ObjaverseStore(config.objaverse_root, config.reading, config.preparation, cache_dir)
+    return GraspXLObjects(
+        graspxl_root(motions.graspxl_root),
+        store,
+        textures=config.textures,
+        reading=config.reading,
+        preparation=config.preparation,
+        registration=config.registration,
+        cache_dir=cache_dir,
+    )

@@ -18,8 +18,8 @@ from typing import Any
 
 from datagen.child import BAD_INPUT, ChildError, run_child
 from datagen.config import DatasetConfig, config_as_yaml, provenance_of
-from datagen.library import open_library
 from datagen.plan import PLAN_FILE, Plan, make_plan, read_plan, same_plan, write_plan
+from datagen.select_motions import Selection, select_motions
 from shards.records import DatasetRecord, ShardRecord
 from shards.schema import CONVENTIONS, SCHEMA_VERSION
 from shards.writer import begin_dataset, commit_shard, is_motion_staged, is_shard_committed
@@ -38,6 +38,7 @@ class RenderOptions:
     device: str  # auto, cpu, cuda, optix, hip, metal
     workers: int
     threads_per_worker: int | None  # None: the cores divided by the workers
+    licence_allow: tuple[str, ...] | None = None  # as in load_config; the workers load the file themselves
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,21 +51,18 @@ class Progress:
     total: int
 
 
-def plan_dataset(config: DatasetConfig, out: Path) -> Plan:
-    """Write dataset.json and plan.parquet, or check that those which are there say the same.
+def plan_dataset(
+    config: DatasetConfig,
+    out: Path,
+    *,
+    workers: int = 1,
+    report: Callable[[int, int], None] | None = None,
+) -> tuple[Plan, Selection]:
+    """Write dataset.json, selection.parquet and plan.parquet, or check that those which are there say the same.
 
-    ShardError when `out` holds a dataset of another configuration.
+    `workers` and `report` are those of `select_motions`. ShardError when `out` holds a dataset of
+    another configuration.
     """
-    plan = make_plan(
-        config.plan,
-        dataset_seed=config.seed,
-        object_uids=[uid for uid in open_library(config.objects).uids() if uid not in config.objects.exclude],
-        split_rule=config.split,
-        n_cameras=config.sampling.cameras.n_cameras,
-        n_frames=config.sampling.clip.n_frames,
-        image_size=config.sampling.cameras.image_size,
-        samples=config.sampling.render.samples,
-    )
     record = DatasetRecord(
         schema_version=SCHEMA_VERSION,
         name=config.name,
@@ -74,15 +72,27 @@ def plan_dataset(config: DatasetConfig, out: Path) -> Plan:
         split_rule=config.split,
     )
     begin_dataset(out, record)
+    selection = select_motions(config, out, workers=workers, report=report)
+    plan = make_plan(
+        config.plan,
+        dataset_seed=config.seed,
+        candidates=[decision.candidate for decision in selection.kept],
+        left_probability=config.hand.left_probability,
+        split_rule=config.split,
+        n_cameras=config.sampling.cameras.n_cameras,
+        n_frames=config.sampling.clip.n_frames,
+        image_size=config.sampling.cameras.image_size,
+        samples=config.sampling.render.samples,
+    )
     path = out / PLAN_FILE
     if not path.exists():
         write_plan(plan, path)
     elif not same_plan(read_plan(path), plan):
         raise PipelineError(
-            f"{path}: differs from the plan of this configuration (the object library has changed?); "
-            "choose another --out, or delete this one to start over"
+            f"{path}: differs from the plan of this configuration (have objects, recordings or the takedown "
+            "list changed?); choose another --out, or delete this one to start over"
         )
-    return plan
+    return plan, selection
 
 
 def render_shard(
@@ -126,6 +136,8 @@ def _run_workers(
 
         command = [sys.executable, "-m", "datagen.worker", "--config", str(config_path), "--out", str(out)]
         command += ["--motion", str(motion_index), "--device", options.device, "--threads", str(threads)]
+        if options.licence_allow is not None:
+            command += ["--license-allow", ",".join(options.licence_allow)]
         log = out / "staging" / f"shard-{shard:05d}" / f"motion-{motion_index:06d}.log"
         try:
             # BLAS threads would only fight with Cycles, and one thread sums in one order everywhere.

@@ -1,4 +1,4 @@
-"""What to render: motion -> object and shard, decided before anything is rendered.
+"""What to render: motion -> object, recorded sequence, hand and shard, decided before anything is rendered.
 
 A motion is one grasp sequence seen by all cameras; a clip is one motion seen by one
 camera. The plan is a pure function of the configuration, so that any shard, on any
@@ -15,10 +15,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from datagen.objects.mirror import mirrored_uid
+from datagen.sampling.streams import Stream, stream_rng
 from shards.splits import SplitRule, split_of_object
 
 __all__ = [
     "PLAN_FILE",
+    "Candidate",
     "MotionPlan",
     "Plan",
     "PlanConfig",
@@ -45,13 +48,23 @@ class PlanConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Candidate:
+    """What a motion may be made of: an object, and a recorded sequence of it where motions are recorded."""
+
+    object_uid: str
+    sequence_id: str  # empty: the motion is simulated
+
+
+@dataclass(frozen=True, kw_only=True)
 class MotionPlan:
     """One row of plan.parquet."""
 
     motion_index: int
     motion_id: str
     shard: int
-    object_uid: str
+    object_uid: str  # as drawn: of the mirror image where a recorded motion is mirrored
+    sequence_id: str  # of the recorded motion; empty: simulated
+    hand_side: str  # right or left
     split: str
     n_cameras: int
     n_frames: int
@@ -87,37 +100,66 @@ def make_plan(
     config: PlanConfig,
     *,
     dataset_seed: int,
-    object_uids: Sequence[str],
+    candidates: Sequence[Candidate],
+    left_probability: float,
     split_rule: SplitRule,
     n_cameras: int,
     n_frames: int,
     image_size: tuple[int, int],
     samples: int,
 ) -> Plan:
-    """Deal the objects out in shuffled rounds: every object once before any object twice."""
-    if not object_uids:
+    """Deal the objects out in shuffled rounds: every object once before any object twice.
+
+    Of an object with several recorded sequences each round takes another one; when all sequences
+    are used up they come again. A left hand is the mirror image of a right one; a recorded motion
+    is mirrored with its object, a simulated one is simulated with the mirrored object instead.
+    """
+    if not candidates:
         raise PlanError(
-            "the object library is empty: expected at least one object; check objects.* in the config"
+            "there is nothing to plan: expected at least one object that the selection keeps; "
+            "see what it removes: datagen select"
         )
-    rng = np.random.default_rng(np.random.SeedSequence([dataset_seed, PLAN_STREAM]))
-    uids = sorted(object_uids)
-    rounds = -(-config.motions // len(uids))
-    order = np.concatenate([rng.permutation(len(uids)) for _ in range(rounds)])[: config.motions]
     cost = n_cameras * n_frames * image_size[0] * image_size[1] * samples / 1e6
-    motions = tuple(
-        MotionPlan(
-            motion_index=index,
-            motion_id=f"motion-{index:06d}",
-            shard=index // config.motions_per_shard,
-            object_uid=uids[choice],
-            split=split_of_object(uids[choice], split_rule),
-            n_cameras=n_cameras,
-            n_frames=n_frames,
-            cost_megapixel_samples=cost,
+    motions = []
+    for index, candidate in enumerate(_dealt(candidates, config.motions, dataset_seed)):
+        is_left = stream_rng(dataset_seed, index, Stream.HAND_SIDE).uniform() < left_probability
+        uid = candidate.object_uid
+        if is_left and candidate.sequence_id:
+            uid = mirrored_uid(uid)
+        motions.append(
+            MotionPlan(
+                motion_index=index,
+                motion_id=f"motion-{index:06d}",
+                shard=index // config.motions_per_shard,
+                object_uid=uid,
+                sequence_id=candidate.sequence_id,
+                hand_side="left" if is_left else "right",
+                split=split_of_object(uid, split_rule),
+                n_cameras=n_cameras,
+                n_frames=n_frames,
+                cost_megapixel_samples=cost,
+            )
         )
-        for index, choice in enumerate(order)
-    )
-    return Plan(motions=motions)
+    return Plan(motions=tuple(motions))
+
+
+def _dealt(candidates: Sequence[Candidate], n_motions: int, dataset_seed: int) -> list[Candidate]:
+    """`n_motions` candidates in dealing order, whatever the order they came in."""
+    of_object: dict[str, list[Candidate]] = {}
+    for candidate in sorted(candidates, key=lambda c: (c.object_uid, c.sequence_id)):
+        of_object.setdefault(candidate.object_uid, []).append(candidate)
+    shuffle = np.random.default_rng(np.random.SeedSequence([dataset_seed, PLAN_STREAM, 1]))
+    for group in of_object.values():
+        shuffle.shuffle(group)  # type: ignore[arg-type]
+    rng = np.random.default_rng(np.random.SeedSequence([dataset_seed, PLAN_STREAM]))
+    deepest = max(len(group) for group in of_object.values())
+    dealt: list[Candidate] = []
+    turn = 0
+    while len(dealt) < n_motions:
+        this_round = [group[turn] for group in of_object.values() if len(group) > turn]
+        dealt += [this_round[i] for i in rng.permutation(len(this_round))]
+        turn = (turn + 1) % deepest
+    return dealt[:n_motions]
 
 
 def write_plan(plan: Plan, path: Path) -> None:

@@ -16,19 +16,17 @@ import numpy as np
 from datagen.annotate import MotionGeometry, annotate_frame, hand_object_distances
 from datagen.child import BAD_INPUT, ChildError, die_with_parent, emit, run_child
 from datagen.config import DatasetConfig, load_config, provenance_of
-from datagen.grasps.synthesise import synthesise_grasp
-from datagen.hands.model import load_open_hand, shape_hand
-from datagen.hands.skin import load_open_skin
-from datagen.library import open_library
+from datagen.grasps.replay import ReplayError
+from datagen.hand_source import open_hand
+from datagen.hands.model import shape_hand
+from datagen.input_error import InputError
+from datagen.motion import NoGraspError, UnusableObjectError, drawn_sequence, load_object
 from datagen.objects.asset import ObjectAsset
-from datagen.objects.errors import ObjectError
 from datagen.objects.fields import learning_targets
 from datagen.pack import RenderRecord, clip_row, encoded_rgb, frame_row, object_row
 from datagen.plan import PLAN_FILE, MotionPlan, read_plan
-from datagen.sampling.appearance import sample_betas
 from datagen.sampling.errors import SamplingError
 from datagen.sampling.motion import SampledMotion, sample_scene
-from datagen.sampling.streams import Stream, stream_rng
 from datagen.scene_file import save_scene
 from datagen.timing import PhaseTimer
 from shards.errors import ShardError
@@ -61,10 +59,6 @@ class Job:
         return provenance_of(self.config)
 
 
-class NoGraspError(ValueError):
-    """No attempt at this motion was worth keeping; the message counts the reasons."""
-
-
 def main(arguments: list[str] | None = None) -> None:
     """Render and stage one motion; progress as JSON lines on standard output."""
     parser = argparse.ArgumentParser(prog="python -m datagen.worker", description=main.__doc__)
@@ -73,10 +67,11 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--motion", type=int, required=True)
     parser.add_argument("--device", required=True)
     parser.add_argument("--threads", type=int, required=True)
+    parser.add_argument("--license-allow", type=lambda text: tuple(text.split(",")))
     options = parser.parse_args(arguments)
     die_with_parent()
     job = Job(
-        config=load_config(options.config),
+        config=load_config(options.config, licence_allow=options.license_allow),
         motion=read_plan(options.out / PLAN_FILE).motions[options.motion],
         out=options.out,
         device=options.device,
@@ -84,7 +79,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     try:
         run_job(job)
-    except (ObjectError, ShardError) as error:
+    except (InputError, ShardError) as error:
         _refuse(error)
     except ChildError as error:
         if error.status != BAD_INPUT:
@@ -103,11 +98,11 @@ def run_job(job: Job) -> None:
     timer = PhaseTimer()
     shard, index = job.motion.shard, job.motion.motion_index
     emit(phase="grasp", done=0, total=1)
-    with timer.phase("object"):
-        asset = open_library(job.config.objects).load(job.motion.object_uid)
     try:
+        with timer.phase("object"):
+            asset = load_object(job.config, job.motion)
         sampled = sampled_motion(job, asset, timer)
-    except (NoGraspError, SamplingError) as error:
+    except (UnusableObjectError, NoGraspError, ReplayError, SamplingError) as error:
         provenance, seconds = job.provenance, timer.seconds
         stage_skipped_motion(
             job.out, shard, index, reason=str(error), timings_s=seconds, provenance=provenance
@@ -133,25 +128,20 @@ def run_job(job: Job) -> None:
 
 
 def sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledMotion:
-    """Draw hand shape, grasp and scene, each from its own stream of this motion's seed."""
-    seed, index = job.config.seed, job.motion.motion_index
+    """Grasp and scene of one motion, each draw from its own stream of this motion's seed."""
     with timer.phase("grasp"):
-        betas = sample_betas(stream_rng(seed, index, Stream.HAND_SHAPE), job.config.sampling.appearance)
-        shaped = shape_hand(load_open_hand(), betas)
-        found = synthesise_grasp(shaped, asset, job.config.grasp, stream_rng(seed, index, Stream.GRASP))
-    if found.sequence is None:
-        reasons = ", ".join(f"{reason} {count}" for reason, count in found.failure_counts().items())
-        raise NoGraspError(f"no grasp kept for {asset.uid} in {found.attempts} attempts ({reasons})")
+        hand = open_hand(job.config.hand)
+        sequence = drawn_sequence(job.config, job.motion, hand.right, asset)
     emit(phase="scene", done=0, total=1)
     with timer.phase("scene"):
         return sample_scene(
-            found.sequence,
-            shaped,
-            load_open_skin(),
+            sequence,
+            shape_hand(hand.model(sequence.side), sequence.betas),
+            hand.skins,
             asset,
             job.config.sampling,
-            dataset_seed=seed,
-            motion_index=index,
+            dataset_seed=job.config.seed,
+            motion_index=job.motion.motion_index,
             motion_id=job.motion.motion_id,
         )
 

@@ -52,7 +52,11 @@ CONVENTIONS = (
 class ObjectRow:
     """One object of a shard, once, however many motions use it."""
 
-    object_uid: str = column("string", meaning="Identity of the object across the data set; splits hash it.")
+    object_uid: str = column(
+        "string",
+        meaning="Identity of the object across the data set. Splits hash what comes before an '@': "
+        "variants of one object (other size, mirrored) stay together.",
+    )
     name: str = column("string", meaning="Short human name.")
     source: str = column("string", meaning="Collection the object comes from.")
     licence: str = column("string", meaning="SPDX identifier of the object's licence.")
@@ -120,6 +124,12 @@ class ObjectRow:
         "int32", unit="px", meaning="Longest side of the largest base-colour image; 0 without one."
     )
     color_detail: float = column("float32", meaning="Colour detail of the texture; larger is richer.")
+    registration_residual: float = column(
+        "float32",
+        allow_nan=True,
+        meaning="Where a textured original was matched onto the mesh of a recorded motion: 95th percentile of "
+        "their distance over the bounding box's diagonal; NaN otherwise.",
+    )
     watertight_source: bool = column("bool", meaning="Whether the source mesh was closed before any repair.")
 
 
@@ -137,7 +147,7 @@ class ClipRow:
     camera_index: int = column("int32", meaning="Number of the camera within the motion.")
     object_uid: str = column("string", meaning="Row of objects.parquet.")
     split: str = column(
-        "string", choices=("train", "val", "test"), meaning="By hash of object_uid, never by clip."
+        "string", choices=("train", "val", "test"), meaning="By hash of the object, never by clip."
     )
     dataset_seed: int = column("int64", meaning="First entropy word of every random stream of the data set.")
     n_frames: int = column("int32", meaning="Rows of this clip in frames.parquet.")
@@ -152,12 +162,20 @@ class ClipRow:
     )
 
     hand_model: str = column("string", meaning="Hand model in MANO layout: openhand or mano.")
+    hand_stands_in_for: str = column(
+        "string",
+        meaning="Hand model the motion was recorded with, where hand_model is only an approximate stand-in "
+        "for it (then contacts are approximate too); empty otherwise.",
+    )
     hand_side: str = column("string", choices=("right", "left"), meaning="Which hand.")
     flat_hand_mean: bool = column(
         "bool", meaning="True: hand_pose is the full rotation; false: an offset from the model's mean pose."
     )
     betas: Float[np.ndarray, "beta"] = column(
         "float32", "beta", meaning="Shape coefficients of the hand model."
+    )
+    skin_model: str = column(
+        "string", meaning="Skin texture model: open, or html with its variant (html model_sr)."
     )
     skin_coefficients: Float[np.ndarray, "coefficient"] = column(
         "float32", "coefficient", meaning="Coefficients of the skin texture model."
@@ -171,6 +189,9 @@ class ClipRow:
 
     grasp_source: str = column("string", meaning="Where the motion comes from: synthesised or graspxl.")
     grasp_sequence_id: str = column("string", meaning="Identity of the grasp sequence in its source.")
+    grasp_licence: str = column(
+        "string", meaning="SPDX licence of a recorded motion, which its poses keep; empty when simulated."
+    )
     grasp_frame: int = column("int32", meaning="First frame in which the closed hand carries the object.")
     rise_m: float = column(
         "float32", unit="m", allow_nan=True, meaning="Object height at the end minus start."
@@ -186,10 +207,17 @@ class ClipRow:
         "float32", unit="m", allow_nan=True, meaning="Slip in the hand during the lift."
     )
     slip_manipulation_m: float = column(
-        "float32", unit="m", allow_nan=True, meaning="Slip during manipulation."
+        "float32", unit="m", allow_nan=True, meaning="Slip during manipulation; NaN where there is none."
+    )
+    digit_distance_m: Float[np.ndarray, "5"] = column(
+        "float32",
+        5,
+        unit="m",
+        meaning="Smallest signed distance of thumb, index, middle, ring and pinky to the object, median while "
+        "it is carried; negative inside.",
     )
     grasp_attempts: int = column(
-        "int32", meaning="Simulations until this grasp was kept, itself included; 0 read."
+        "int32", meaning="Simulations until this grasp was kept, itself included; 0: recorded."
     )
 
     light_position_world: Float[np.ndarray, "light 3"] = column(
@@ -321,7 +349,12 @@ class FrameRow:
         "float32", meaning="Visible / amodal pixels; 0 when there are none."
     )
     contact_force_n: Float[np.ndarray, "5"] = column(
-        "float32", 5, unit="N", meaning="Normal force per digit: thumb, index, middle, ring, pinky."
+        "float32",
+        5,
+        unit="N",
+        allow_nan=True,
+        meaning="Normal force per digit: thumb, index, middle, ring, pinky; NaN where a motion was recorded "
+        "without forces.",
     )
     hand_object_distance_m: float = column(
         "float32",

@@ -28,10 +28,13 @@ class SplitRule:
 def split_of_object(object_uid: str, rule: SplitRule) -> Split:
     """The split of an object. Depends on nothing but the uid and the rule.
 
-    The first 8 bytes of SHA-256 of the uid, as a fraction u of 2^64: test if u < test,
-    val if u < test + val, else train. Raising val_fraction moves objects from train only.
+    What follows an "@" names a variant (another size, the mirror image) and does not count, so
+    variants never straddle splits. The first 8 bytes of SHA-256 of the rest, as a fraction u of
+    2^64: test if u < test, val if u < test + val, else train. Raising val_fraction moves objects
+    from train only.
     """
-    word = int.from_bytes(hashlib.sha256(object_uid.encode("utf-8")).digest()[:8], "big")
+    identity = object_uid.partition("@")[0]
+    word = int.from_bytes(hashlib.sha256(identity.encode("utf-8")).digest()[:8], "big")
     u = word / 2**64
     if u < rule.test_fraction:
         return "test"

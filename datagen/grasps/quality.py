@@ -2,22 +2,21 @@
 
 from dataclasses import dataclass
 
-import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 from datagen.grasps.config import GraspConfig
+from datagen.grasps.contact import digit_distances, signed_distances
 from datagen.grasps.hand_body import HandBody, local_rotations
 from datagen.grasps.movement import Movement
+from datagen.grasps.object_surface import ObjectSurface
 from datagen.grasps.sequence import GraspQuality, TableEdge
 from datagen.grasps.simulation import Failure, MotionTrace
-from datagen.hands.model import PosedHand
-from datagen.objects.asset import ObjectAsset
+from datagen.hands.model import HandModel, PosedHand
 
 __all__ = [
     "HandParameters",
-    "ObjectSurface",
     "below_table",
     "hand_center",
     "hand_parameters",
@@ -27,35 +26,12 @@ __all__ = [
     "rejection",
 ]
 
+CONTACT_INSTANTS = 5  # at which the digits' distances are measured
 INSTANTS = 24  # of the carried motion; the approach gets a few more
 CONTACT_N = 0.05
 SUNK_M = 0.002
 FINGER_MIDDLE_JOINTS = [2, 5, 8, 11]  # PIP
 THUMB_TIP = 16  # row of PosedHand.joints_world
-
-
-class ObjectSurface:
-    """Signed distance to the object's own mesh, or to its solid where the mesh is open."""
-
-    def __init__(self, obj: ObjectAsset) -> None:
-        source = obj.mesh if obj.solid.watertight_source else obj.solid
-        self.verts = np.ascontiguousarray(source.verts_obj, dtype=np.float64)
-        self.faces = np.ascontiguousarray(source.faces, dtype=np.int64)
-        self.low, self.high = self.verts.min(0), self.verts.max(0)
-
-    def depth(self, points_obj: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
-        """How deep each point lies inside (m); 0 outside. Generalised winding number for the sign."""
-        depth = np.zeros(len(points_obj))
-        near = ((points_obj > self.low) & (points_obj < self.high)).all(1)
-        if near.any():
-            signed = igl.signed_distance(
-                np.ascontiguousarray(points_obj[near]),
-                self.verts,
-                self.faces,
-                igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
-            )[0]
-            depth[near] = np.maximum(-signed, 0.0)
-        return depth
 
 
 def measured_instants(grasp_frame: int, frames: int) -> Int[np.ndarray, "instant"]:
@@ -102,6 +78,7 @@ def hand_center(posed: PosedHand) -> Float[np.ndarray, "instant 3"]:
 
 
 def measure_quality(
+    model: HandModel,
     posed: PosedHand,
     surface: ObjectSurface,
     trace: MotionTrace,
@@ -116,6 +93,9 @@ def measure_quality(
     lifting = com_hand[trace.grasp_frame : trace.lifted_frame] - com_hand[trace.grasp_frame]
     turning = com_hand[trace.lifted_frame :] - com_hand[trace.lifted_frame]
     end = trace.T_world_from_obj[-1, :3, 3]
+    carried = np.flatnonzero(rows >= trace.grasp_frame)
+    looked = carried[np.linspace(0, len(carried) - 1, CONTACT_INSTANTS).round().astype(int)]
+    distances = signed_distances(surface, posed.verts_world[looked], trace.T_world_from_obj[rows[looked]])
     return GraspQuality(
         rise_m=float(end[2] - trace.T_world_from_obj[0, 2, 3]),
         center_distance_m=float(np.linalg.norm(hand_center(posed)[-1] - end)),
@@ -125,6 +105,7 @@ def measure_quality(
         slip_manipulation_m=float(np.linalg.norm(turning, axis=1).max()),
         contact_force_n=float(trace.force_n[-1].sum()),
         attempts=attempts,
+        digit_distance_m=np.median(digit_distances(model, distances), axis=0),
     )
 
 

@@ -31,9 +31,11 @@ class GraspQuality:
     max_penetration_m: float  # hand vertices into the object's own mesh, worst instant
     digits_in_contact: int  # of five, at the end
     slip_lift_m: float
-    slip_manipulation_m: float
-    contact_force_n: float  # summed normal force at the end
-    attempts: int  # simulated until this one was kept, itself included
+    slip_manipulation_m: float  # NaN: nothing but a lift was recorded
+    contact_force_n: float  # summed normal force at the end; NaN: recorded without forces
+    attempts: int  # simulated until this one was kept, itself included; 0: recorded
+    # Smallest signed distance of thumb, index, middle, ring and pinky; median while carried.
+    digit_distance_m: Float[np.ndarray, "5"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,10 +59,12 @@ class GraspSequence:
     hand_pose: Float[np.ndarray, "frame 45"]
     hand_translation_world: Float[np.ndarray, "frame 3"]
     T_world_from_obj: Float[np.ndarray, "frame 4 4"]
-    contact_force_n: Float[np.ndarray, "frame 5"]  # per digit: thumb, index, middle, ring, pinky
+    contact_force_n: Float[np.ndarray, "frame 5"]  # thumb, index, middle, ring, pinky; NaN: recorded without
     grasp_frame: int  # first frame in which the closed hand carries the object
     quality: GraspQuality
     start: StartKind = "table"  # resting on the table, overhanging its edge, or held out in mid-air
     table_edge: TableEdge | None = None  # where the table must end; None: it may reach anywhere
     first_drawn_frame: int = 0  # before it the object may hang in the air (start "held")
     source: Literal["synthesised", "graspxl"] = "synthesised"
+    licence: str = ""  # SPDX, of a recorded motion
+    stands_in_for: str = ""  # hand model of the recording, where `hand_model` only approximates it

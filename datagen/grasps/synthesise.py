@@ -9,10 +9,10 @@ import numpy as np
 from datagen.grasps.config import GraspConfig
 from datagen.grasps.hand_body import HandBody, build_hand_body
 from datagen.grasps.movement import Movement, measure_movement
+from datagen.grasps.object_surface import ObjectSurface
 from datagen.grasps.preshapes import build_preshapes
 from datagen.grasps.proposals import propose, sample_surface
 from datagen.grasps.quality import (
-    ObjectSurface,
     below_table,
     hand_parameters,
     measure_quality,
@@ -124,7 +124,9 @@ def _judge(
         translation_world=parameters.translation_world[rows],
         flat_hand_mean=True,
     )
-    quality = measure_quality(posed, bench.surface, trace, rows, bench.world.com_obj, attempt)
+    quality = measure_quality(
+        bench.hand.model, posed, bench.surface, trace, rows, bench.world.com_obj, attempt
+    )
     movement = measure_movement(trace.T_world_from_obj[trace.grasp_frame :])
     reason = rejection(quality, trace, movement, bench.config)
     if reason is not None:

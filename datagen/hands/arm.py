@@ -11,7 +11,16 @@ from datagen.hands.forearm_uv import continued_uv
 from datagen.hands.model import PosedHand, ShapedHand
 from datagen.hands.tube import close_end, tube_corner_uv, tube_faces
 
-__all__ = ["ARM_SKIN", "HAND_SKIN", "SLEEVE", "ArmStyle", "DressedHand", "dress_hand", "dressed_verts"]
+__all__ = [
+    "ARM_SKIN",
+    "HAND_SKIN",
+    "SLEEVE",
+    "ArmStyle",
+    "DressedHand",
+    "dress_hand",
+    "dressed_verts",
+    "wrist_cap",
+]
 
 HAND_SKIN, ARM_SKIN, SLEEVE = 0, 1, 2  # the values of datagen.scene.HandSurface.face_part
 
@@ -83,7 +92,7 @@ def dress_hand(shaped: ShapedHand, style: ArmStyle) -> DressedHand:
             f"= {style.length_m - style.cuff_m:.3f}, or None for a bare arm"
         )
     model = shaped.model
-    hand = ~_wrist_cap(model.faces, model.wrist_loop)
+    hand = ~wrist_cap(model.faces, model.wrist_loop)
     frame = _arm_axis(shaped, model.faces[hand])
     arm_verts, arm_faces, arm_uv = _forearm(shaped, frame, style, model.faces[hand], model.corner_uv[hand])
     n_hand, n_loop = len(shaped.verts_rest), len(model.wrist_loop)
@@ -114,7 +123,7 @@ def dressed_verts(dressed: DressedHand, posed: PosedHand) -> Float[np.ndarray, "
     return np.concatenate([posed.verts_world, extra_world], axis=1)
 
 
-def _wrist_cap(faces: Int[np.ndarray, "face 3"], loop: Int[np.ndarray, "loop"]) -> Bool[np.ndarray, "face"]:
+def wrist_cap(faces: Int[np.ndarray, "face 3"], loop: Int[np.ndarray, "loop"]) -> Bool[np.ndarray, "face"]:
     """Faces beyond the wrist ring: the smaller of the parts into which the ring cuts the mesh, if it does."""
     ring_edges = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1)
     on_ring = {tuple(edge) for edge in ring_edges.tolist()}

@@ -9,11 +9,13 @@ from io import BytesIO
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from PIL import Image
+from scipy.ndimage import distance_transform_edt
 
 __all__ = [
     "SkinBasis",
     "decode_skin",
     "load_open_skin",
+    "nearest_texels",
     "open_nail_mask_png",
     "open_skin_height_png",
     "sample_skin_coefficients",
@@ -28,9 +30,10 @@ _MAX_COEFFICIENT = 2.0  # beyond two standard deviations colours turn garish
 class SkinBasis:
     """A texture model. Values are sRGB, 0..255; one unit of a coefficient is one standard deviation.
 
-    `index_map` places each value in a flattened (channel, column, row) image, as HTML does;
-    texels it leaves out stay black. `anchors` are the coefficients of the skins the model was
-    made from (no rows when they are not known).
+    `index_map` places each value in a flattened (channel, column, row) image, as HTML does. Texels
+    it leaves out stay black, or copy the texel that `fill` (`nearest_texels`) names for them.
+    `anchors` are the coefficients of the skins the model was made from (no rows when they are not
+    known).
     """
 
     name: str
@@ -40,6 +43,7 @@ class SkinBasis:
     index_map: Int[np.ndarray, "value"]
     axes: tuple[str, ...]  # what each coefficient changes; "" when unknown
     anchors: Float[np.ndarray, "skin coefficient"]
+    fill: Int[np.ndarray, "texel"] | None = None
 
 
 def decode_skin(
@@ -52,7 +56,23 @@ def decode_skin(
     values = basis.mean + basis.basis @ coefficients.astype(basis.basis.dtype)
     flat = np.zeros(3 * basis.size**2, dtype=np.uint8)
     flat[basis.index_map] = np.clip(np.rint(values), 0, 255)
+    if basis.fill is not None:
+        flat = flat[basis.fill]
     return np.ascontiguousarray(flat.reshape(3, basis.size, basis.size).transpose(2, 1, 0))
+
+
+def nearest_texels(index_map: Int[np.ndarray, "value"], size: int) -> Int[np.ndarray, "texel"]:
+    """For each texel of the flattened image the nearest one that `index_map` writes, in its channel.
+
+    Filtering at the border of an island then mixes skin with skin, not with the black around it.
+    """
+    empty = np.ones(3 * size**2, dtype=bool)
+    empty[index_map] = False
+    channels = []
+    for number, outside in enumerate(empty.reshape(3, size, size)):
+        column, row = distance_transform_edt(outside, return_distances=False, return_indices=True)
+        channels.append((number * size + column) * size + row)
+    return np.stack(channels).reshape(-1)
 
 
 def sample_skin_coefficients(rng: np.random.Generator, basis: SkinBasis) -> Float[np.ndarray, "coefficient"]:

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.objects.mesh import ObjectMesh
+from datagen.objects.registration import Registration
 from datagen.objects.texture_quality import TextureQuality
 
 __all__ = ["ConvexPart", "ObjectAsset", "Solid", "SolidFit"]
@@ -27,6 +28,7 @@ class SolidFit:
     deviation_p99_m: float
     deviation_max_m: float
     uncovered_max_m: float  # outer points of the drawn mesh to the solid surface
+    # NaN for a solid without convex parts:
     hull_excess_p99_m: float  # hull surface that lies outside the solid
     hull_excess_max_m: float
     hull_uncovered_max_m: float  # depth of solid surface points that no hull contains
@@ -41,7 +43,7 @@ class Solid:
 
     verts_obj: Float[np.ndarray, "vert 3"]
     faces: Int[np.ndarray, "face 3"]
-    parts: tuple[ConvexPart, ...]
+    parts: tuple[ConvexPart, ...]  # empty where no physics will run (recorded motions)
     watertight_source: bool  # the drawn mesh was closed; its own surface is kept
     fit: SolidFit | None = None  # None: made by hand, not measured
 
@@ -62,3 +64,4 @@ class ObjectAsset:
     texture: TextureQuality
     # Axes, unit and centring in one similarity: x_obj = T_obj_from_file @ x_file.
     T_obj_from_file: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    registration: Registration | None = None  # drawn in place of its rescaled copy (GraspXL)

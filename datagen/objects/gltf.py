@@ -7,12 +7,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from datagen.objects.draco import DRACO, decoded_primitive
 from datagen.objects.errors import ObjectError
 from datagen.objects.file_mesh import FileMesh
-from datagen.objects.gltf_file import GltfFile, open_gltf
+from datagen.objects.gltf_file import MAX_FILE_MB, GltfFile, open_gltf
+from datagen.objects.gltf_materials import SPECULAR_GLOSS, UNLIT, WEBP, read_material, transformed_uv, uv_set
 from datagen.objects.mesh import Material
 
 __all__ = ["read_gltf"]
+
+# What a file may require of its reader; anything else would be drawn wrongly.
+IMPLEMENTED = (
+    DRACO,
+    WEBP,
+    SPECULAR_GLOSS,
+    UNLIT,
+    "KHR_materials_emissive_strength",
+    "KHR_materials_ior",
+    "KHR_materials_transmission",
+    "KHR_mesh_quantization",
+    "KHR_texture_transform",
+)
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
 UNLIT_GREY = Material(name="unnamed", base_color_rgba=(1.0, 1.0, 1.0, 1.0), roughness=1.0)
@@ -29,15 +44,17 @@ class _Piece:
     material: int
 
 
-def read_gltf(path: Path, data: bytes) -> FileMesh:
+def read_gltf(path: Path, data: bytes, *, max_file_mb: float = MAX_FILE_MB) -> FileMesh:
     """All triangles of the default scene. Axes Y-up, metres (as the format says).
 
-    `data` is the file's content; `path` finds files beside it and names it in errors.
+    `data` is the file's content; `path` finds files beside it (each up to `max_file_mb`) and names
+    it in errors.
     """
-    file = open_gltf(path, data)
-    _refuse_what_moves_or_is_packed(file)
-    materials = [_material(file, entry) for entry in file.json.get("materials", [])]
+    file = open_gltf(path, data, max_file_mb=max_file_mb)
+    _refuse_unknown_extensions(file)
+    _refuse_what_moves(file)
     try:
+        materials = [read_material(file, entry) for entry in file.json.get("materials", [])]
         pieces = [
             _piece(file, primitive, T_scene_from_node, len(materials))
             for mesh, T_scene_from_node in _placed_meshes(file)
@@ -49,25 +66,40 @@ def read_gltf(path: Path, data: bytes) -> FileMesh:
     return _joined(pieces, (*materials, UNLIT_GREY))
 
 
-def _refuse_what_moves_or_is_packed(file: GltfFile) -> None:
-    packed = [
-        name for name in file.json.get("extensionsRequired", []) if "draco" in name or "meshopt" in name
-    ]
-    if packed:
+def _refuse_unknown_extensions(file: GltfFile) -> None:
+    unknown = [name for name in file.json.get("extensionsRequired", []) if name not in IMPLEMENTED]
+    if unknown:
         raise ObjectError(
             file.path,
-            f"is compressed with {', '.join(packed)}",
-            expected="plain glTF buffers",
-            action="Unpack it: `npx @gltf-transform/cli copy in.glb out.glb`.",
+            f"requires {', '.join(map(str, unknown))}",
+            expected=f"no other required extensions than {', '.join(IMPLEMENTED)}",
+            action="Convert it: `npx @gltf-transform/cli copy in.glb out.glb`, or Blender.",
         )
-    for key, what in (("skins", "is skinned"), ("animations", "is animated")):
+
+
+def _refuse_what_moves(file: GltfFile) -> None:
+    """Skins, animations and shapes that morph targets deform are no rigid objects."""
+    channels = [channel for entry in file.json.get("animations", []) for channel in entry.get("channels", [])]
+    morphing = any(channel.get("target", {}).get("path") == "weights" for channel in channels)
+    carriers = [*file.json.get("meshes", []), *file.json.get("nodes", [])]
+    n_morphed = sum(any(entry.get("weights", [])) for entry in carriers)
+    for key, what in (
+        ("skins", "is skinned"),
+        ("animations", "animates morph targets" if morphing else "is animated"),
+    ):
         if file.json.get(key):
-            raise ObjectError(
-                file.path,
-                f"{what} ({len(file.json[key])} {key})",
-                expected="one rigid object",
-                action="Apply the pose in Blender and export without animation.",
-            )
+            raise _moving(file, f"{what} ({len(file.json[key])} {key})")
+    if n_morphed:
+        raise _moving(file, f"is deformed by morph targets ({n_morphed} with weights)")
+
+
+def _moving(file: GltfFile, problem: str) -> ObjectError:
+    return ObjectError(
+        file.path,
+        problem,
+        expected="one rigid object",
+        action="Apply the pose in Blender and export without animation.",
+    )
 
 
 def _node_matrix(node: dict[str, Any]) -> Float[np.ndarray, "4 4"]:
@@ -112,30 +144,41 @@ def _placed_meshes(file: GltfFile) -> list[tuple[int, Float[np.ndarray, "4 4"]]]
 def _piece(
     file: GltfFile, primitive: dict[str, Any], T_scene_from_node: Float[np.ndarray, "4 4"], n_materials: int
 ) -> _Piece:
-    attributes = primitive["attributes"]
-    verts = file.accessor(attributes["POSITION"]).astype(np.float64)
-    verts = verts @ T_scene_from_node[:3, :3].T + T_scene_from_node[:3, 3]
-    index = (
-        file.accessor(primitive["indices"])[:, 0].astype(np.int64)
-        if "indices" in primitive
-        else np.arange(len(verts))
-    )
-    faces = _triangles(index, primitive.get("mode", TRIANGLES))
+    packed = decoded_primitive(file, primitive)
+
+    def rows(name: str) -> np.ndarray | None:
+        if packed is not None and name in packed.attributes:
+            return packed.attributes[name]
+        accessor = primitive["attributes"].get(name)
+        return None if accessor is None else file.accessor(accessor)
+
+    positions = rows("POSITION")
+    if positions is None:
+        raise file.damaged("a primitive has no POSITION")
+    verts = positions.astype(np.float64) @ T_scene_from_node[:3, :3].T + T_scene_from_node[:3, 3]
+    faces = packed.faces if packed is not None else _plain_faces(file, primitive, len(verts))
     if len(faces) and (faces.max() >= len(verts)):
         raise file.damaged("a face refers to a vertex that is not there")
     if np.linalg.det(T_scene_from_node[:3, :3]) < 0:
         faces = faces[:, ::-1]
     material = primitive.get("material", n_materials)
-    uv = np.zeros((len(verts), 2))
-    uv_set = f"TEXCOORD_{_uv_set(file, material)}"
-    if uv_set in attributes:
-        uv = file.accessor(attributes[uv_set]).astype(np.float64)
-        uv = _transformed_uv(file, material, uv)
-        uv[:, 1] = 1.0 - uv[:, 1]
-    colors = file.accessor(attributes["COLOR_0"])[:, :3] if "COLOR_0" in attributes else None
+    uv, colors = rows(uv_set(file, material)), rows("COLOR_0")
+    if uv is None:
+        uv = np.zeros((len(verts), 2))
+    else:
+        uv = transformed_uv(file, material, uv.astype(np.float64)) * [1.0, -1.0] + [0.0, 1.0]
     if colors is not None:
-        colors = colors.astype(np.float64)
+        colors = colors[:, :3].astype(np.float64)
+    if any(len(column) != len(verts) for column in (uv, colors) if column is not None):
+        raise file.damaged("the attributes of a primitive differ in length")
     return _Piece(verts=verts, faces=faces, uv=uv, colors=colors, material=material)
+
+
+def _plain_faces(file: GltfFile, primitive: dict[str, Any], n_verts: int) -> Int[np.ndarray, "face 3"]:
+    index = np.arange(n_verts)
+    if "indices" in primitive:
+        index = file.accessor(primitive["indices"])[:, 0].astype(np.int64)
+    return _triangles(index, primitive.get("mode", TRIANGLES))
 
 
 def _triangles(index: Int[np.ndarray, "corner"], mode: int) -> Int[np.ndarray, "face 3"]:
@@ -146,60 +189,6 @@ def _triangles(index: Int[np.ndarray, "corner"], mode: int) -> Int[np.ndarray, "
         faces[1::2] = faces[1::2, [1, 0, 2]]
         return faces
     return np.stack([np.full(len(index) - 2, index[0]), index[1:-1], index[2:]], axis=1)
-
-
-def _base_color_info(file: GltfFile, material: int) -> dict[str, Any]:
-    materials = file.json.get("materials", [])
-    if material >= len(materials):
-        return {}
-    return materials[material].get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
-
-
-def _uv_set(file: GltfFile, material: int) -> int:
-    info = _base_color_info(file, material)
-    moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-    return moved.get("texCoord", info.get("texCoord", 0))
-
-
-def _transformed_uv(
-    file: GltfFile, material: int, uv: Float[np.ndarray, "vert 2"]
-) -> Float[np.ndarray, "vert 2"]:
-    """KHR_texture_transform of the base colour, applied to the coordinates themselves."""
-    moved = _base_color_info(file, material).get("extensions", {}).get("KHR_texture_transform")
-    if not moved:
-        return uv
-    angle = moved.get("rotation", 0.0)
-    rotation = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
-    return (uv * moved.get("scale", (1.0, 1.0))) @ rotation.T + moved.get("offset", (0.0, 0.0))
-
-
-def _texture(file: GltfFile, info: dict[str, Any] | None) -> bytes | None:
-    if info is None:
-        return None
-    texture = file.json["textures"][info["index"]]
-    source = (
-        texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source", texture.get("source"))
-    )
-    return None if source is None else file.image(source)
-
-
-def _material(file: GltfFile, entry: dict[str, Any]) -> Material:
-    pbr = entry.get("pbrMetallicRoughness", {})
-    extensions = entry.get("extensions", {})
-    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
-    return Material(
-        name=entry.get("name", "unnamed"),
-        base_color_rgba=tuple(map(float, pbr.get("baseColorFactor", (1, 1, 1, 1)))),  # type: ignore[arg-type]
-        base_color_image=_texture(file, pbr.get("baseColorTexture")),
-        metallic=float(pbr.get("metallicFactor", 1)),
-        roughness=float(pbr.get("roughnessFactor", 1)),
-        metallic_roughness_image=_texture(file, pbr.get("metallicRoughnessTexture")),
-        normal_image=_texture(file, entry.get("normalTexture")),
-        emissive_rgb=tuple(float(strength * value) for value in entry.get("emissiveFactor", (0, 0, 0))),  # type: ignore[arg-type]
-        emissive_image=_texture(file, entry.get("emissiveTexture")),
-        transmission=float(extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0)),
-        ior=float(extensions.get("KHR_materials_ior", {}).get("ior", 1.45)),
-    )
 
 
 def _joined(pieces: list[_Piece], materials: tuple[Material, ...]) -> FileMesh:

@@ -11,7 +11,10 @@ import numpy as np
 
 from datagen.objects.errors import ObjectError
 
-__all__ = ["GltfFile", "open_gltf"]
+__all__ = ["MAX_FILE_MB", "GltfFile", "normalised", "open_gltf"]
+
+# A million triangles as text (OBJ), or packed with several 8k images, take less.
+MAX_FILE_MB = 200.0
 
 DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -20,9 +23,12 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 class GltfFile:
     """An opened file: `json` plus typed access to its binary parts."""
 
-    def __init__(self, path: Path, document: dict[str, Any], glb_chunk: bytes | None) -> None:
+    def __init__(
+        self, path: Path, document: dict[str, Any], glb_chunk: bytes | None, max_file_mb: float
+    ) -> None:
         self.path = path
         self.json = document
+        self._max_file_mb = max_file_mb
         self._glb_chunk = glb_chunk
         self._buffers = [self._buffer(entry) for entry in document.get("buffers", [])]
 
@@ -50,7 +56,18 @@ class GltfFile:
                 expected=f"a file at {path}",
                 action="Keep the files of a .gltf together, or export one .glb.",
             )
+        if path.stat().st_size > self._max_file_mb * 1e6:
+            raise ObjectError(
+                self.path,
+                f"its {kind} {uri!r} has {path.stat().st_size / 1e6:.0f} MB",
+                expected=f"at most {self._max_file_mb:g} MB",
+                action="Make the model smaller or raise `max_file_mb`.",
+            )
         return path.read_bytes()
+
+    def view(self, index: int) -> bytes:
+        """The bytes of one bufferView."""
+        return self._view(index)[0]
 
     def _view(self, index: int) -> tuple[bytes, int]:
         view = self.json["bufferViews"][index]
@@ -69,9 +86,7 @@ class GltfFile:
             rows = self._rows(entry["bufferView"], entry.get("byteOffset", 0), dtype, count, width)
         if "sparse" in entry:
             rows = self._with_sparse(rows.copy(), entry["sparse"])
-        if entry.get("normalized"):
-            rows = np.maximum(rows.astype(np.float64) / np.iinfo(dtype).max, -1.0)
-        return rows
+        return normalised(rows, entry)
 
     def _rows(self, view: int, offset: int, dtype: np.dtype, count: int, width: int) -> np.ndarray:
         data, stride = self._view(view)
@@ -97,10 +112,18 @@ class GltfFile:
         entry = self.json["images"][index]
         if "uri" in entry:
             return self._resource(entry["uri"], "texture")
-        return self._view(entry["bufferView"])[0]
+        return self.view(entry["bufferView"])
 
 
-def open_gltf(path: Path, data: bytes) -> GltfFile:
+def normalised(rows: np.ndarray, accessor: dict[str, Any]) -> np.ndarray:
+    """Integers of a normalised accessor as 0..1 or -1..1 (glTF 2.0, 3.11); others unchanged."""
+    if not accessor.get("normalized"):
+        return rows
+    largest = np.iinfo(np.dtype(DTYPES[accessor["componentType"]])).max
+    return np.maximum(rows.astype(np.float64) / largest, -1.0)
+
+
+def open_gltf(path: Path, data: bytes, *, max_file_mb: float = MAX_FILE_MB) -> GltfFile:
     """The content of a .glb or .gltf file (`path` is for messages and for files beside it)."""
     chunk: bytes | None = None
     text = data
@@ -118,7 +141,7 @@ def open_gltf(path: Path, data: bytes) -> GltfFile:
         ) from error
     if not version.startswith("2"):
         raise ObjectError(path, f"is glTF {version}", expected="glTF 2.0", action="Convert it with Blender.")
-    return GltfFile(path, document, chunk)
+    return GltfFile(path, document, chunk, max_file_mb)
 
 
 def _glb_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:

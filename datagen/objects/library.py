@@ -11,12 +11,15 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 
 from datagen.objects.asset import ObjectAsset
+from datagen.objects.description import ObjectDescription
 from datagen.objects.errors import ObjectError
 from datagen.objects.gltf import read_gltf
 from datagen.objects.holdable import holdable_scale, scaled_mesh
+from datagen.objects.licences import UNKNOWN_LICENCE
+from datagen.objects.mesh import ObjectMesh
 from datagen.objects.orientation import outward_mesh
 from datagen.objects.preparation import PreparationConfig, cached_solid, solid_from_bytes
-from datagen.objects.reading import MESH_SUFFIXES, ReadingConfig, object_mesh, read_object
+from datagen.objects.reading import MESH_SUFFIXES, ReadingConfig, ReadObject, object_mesh, read_object
 from datagen.objects.sweethome3d import CatalogueEntry, find_libraries, read_catalogue, read_model
 from datagen.objects.texture_quality import TextureQuality, measure_texture_quality
 
@@ -35,6 +38,12 @@ class ObjectLibrary(Protocol):
 
     def load(self, uid: str) -> ObjectAsset:
         """The object; ObjectError where it cannot be used or the uid is unknown."""
+
+    def describe(self, uid: str) -> ObjectDescription:
+        """What is known without reading the mesh; ObjectError where the uid is unknown."""
+
+    def texture_quality(self, uid: str) -> TextureQuality:
+        """The `texture` that `load` would give, without its costly parts."""
 
 
 def _unknown(where: object, uid: str) -> ObjectError:
@@ -59,9 +68,7 @@ class StarterPack:
 
     def load(self, uid: str) -> ObjectAsset:
         """One starter object; nothing is computed, only unpacked."""
-        if uid not in self._entries:
-            raise _unknown("starter pack", uid)
-        entry = self._entries[uid]
+        entry = self._entry(uid)
         slug = uid.partition("/")[2]
         file_mesh = read_gltf(Path(f"{slug}.glb"), self._archive.read(f"{slug}.glb"))
         read = object_mesh(file_mesh, Path(uid), REFERENCE_READING, unit="m", up_axis="y")
@@ -78,6 +85,19 @@ class StarterPack:
             texture=TextureQuality(**entry["texture"]),
             T_obj_from_file=read.T_obj_from_file,
         )
+
+    def describe(self, uid: str) -> ObjectDescription:
+        """From the pack's index."""
+        return ObjectDescription(licence=self._entry(uid)["licence"])
+
+    def texture_quality(self, uid: str) -> TextureQuality:
+        """From the pack's index."""
+        return TextureQuality(**self._entry(uid)["texture"])
+
+    def _entry(self, uid: str) -> dict[str, Any]:
+        if uid not in self._entries:
+            raise _unknown("starter pack", uid)
+        return self._entries[uid]
 
 
 class MeshFolder:
@@ -116,17 +136,14 @@ class MeshFolder:
 
     def load(self, uid: str) -> ObjectAsset:
         """Read, repair and prepare one mesh; solids come from the cache the second time."""
-        if uid not in self._files:
-            raise _unknown(self._path, uid)
-        file = self._files[uid]
+        file, note = self._file(uid), self._note(uid)
         read = read_object(file, self._reading)
         mesh = outward_mesh(read.mesh)
-        note = self._notes.get(uid.partition("/")[2], {})
         return ObjectAsset(
             uid=uid,
             name=note.get("name") or file.stem,
             source="folder",
-            licence=note.get("licence") or "NOASSERTION",
+            licence=self.describe(uid).licence,
             author=note.get("author") or "unknown",
             url=note.get("url") or "",
             mesh=mesh,
@@ -135,6 +152,23 @@ class MeshFolder:
             texture=measure_texture_quality(mesh),
             T_obj_from_file=read.T_obj_from_file,
         )
+
+    def describe(self, uid: str) -> ObjectDescription:
+        """From `objects.csv`."""
+        self._file(uid)  # names what is not there
+        return ObjectDescription(licence=self._note(uid).get("licence") or UNKNOWN_LICENCE)
+
+    def texture_quality(self, uid: str) -> TextureQuality:
+        """As `load` measures it, without making the solid."""
+        return measure_texture_quality(outward_mesh(read_object(self._file(uid), self._reading).mesh))
+
+    def _file(self, uid: str) -> Path:
+        if uid not in self._files:
+            raise _unknown(self._path, uid)
+        return self._files[uid]
+
+    def _note(self, uid: str) -> dict[str, str]:
+        return self._notes.get(uid.partition("/")[2], {})
 
 
 def _folder_notes(path: Path) -> dict[str, dict[str, str]]:
@@ -181,13 +215,8 @@ class Sweethome3D:
 
     def load(self, uid: str) -> ObjectAsset:
         """Read, repair and prepare one model; solids come from the cache the second time."""
-        if uid not in self._entries:
-            raise _unknown("sweethome3d", uid)
-        library, entry = self._entries[uid]
-        file_mesh = read_model(library, entry)
-        read = object_mesh(file_mesh, Path(uid), REFERENCE_READING, unit="m", up_axis="y")
-        factor = holdable_scale(np.ptp(read.mesh.verts_obj, axis=0))
-        mesh = outward_mesh(scaled_mesh(read.mesh, factor))
+        _, entry = self._entry(uid)
+        read, factor, mesh = self._read(uid)
         return ObjectAsset(
             uid=uid,
             name=entry.name,
@@ -201,6 +230,26 @@ class Sweethome3D:
             texture=measure_texture_quality(mesh),
             T_obj_from_file=np.diag([factor, factor, factor, 1.0]) @ read.T_obj_from_file,
         )
+
+    def describe(self, uid: str) -> ObjectDescription:
+        """From the catalogue."""
+        return ObjectDescription(licence=self._entry(uid)[1].licence)
+
+    def texture_quality(self, uid: str) -> TextureQuality:
+        """As `load` measures it, without making the solid."""
+        return measure_texture_quality(self._read(uid)[2])
+
+    def _entry(self, uid: str) -> tuple[Path, CatalogueEntry]:
+        if uid not in self._entries:
+            raise _unknown("sweethome3d", uid)
+        return self._entries[uid]
+
+    def _read(self, uid: str) -> tuple[ReadObject, float, ObjectMesh]:
+        """The file, its scale, and the drawn mesh at that scale."""
+        file_mesh = read_model(*self._entry(uid))
+        read = object_mesh(file_mesh, Path(uid), REFERENCE_READING, unit="m", up_axis="y")
+        factor = holdable_scale(np.ptp(read.mesh.verts_obj, axis=0))
+        return read, factor, outward_mesh(scaled_mesh(read.mesh, factor))
 
 
 def _is_household(entry: CatalogueEntry) -> bool:

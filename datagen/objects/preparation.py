@@ -29,6 +29,7 @@ __all__ = [
 
 CACHE_VERSION = 1  # raise it when the algorithms change: older cache entries are then ignored
 N_DEVIATION_POINTS = 20000
+NO_HULLS = HullFit(excess_p99_m=float("nan"), excess_max_m=float("nan"), uncovered_max_m=float("nan"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,10 +60,15 @@ REFERENCE_PREPARATION = PreparationConfig(
 )
 
 
-def make_solid(mesh: ObjectMesh, config: PreparationConfig, *, source: object) -> Solid:
-    """Closed surface, convex parts and their measured fit. Takes seconds; see `cached_solid`."""
+def make_solid(
+    mesh: ObjectMesh, config: PreparationConfig, *, source: object, with_parts: bool = True
+) -> Solid:
+    """Closed surface, convex parts and their measured fit. Takes seconds; see `cached_solid`.
+
+    `with_parts=False` leaves out the convex parts, which take most of the time and only physics needs.
+    """
     surface = closed_surface(mesh.verts_obj, mesh.faces, config.solid, source=source)
-    parts, hulls = convex_parts(surface, config.convex)
+    parts, hulls = convex_parts(surface, config.convex) if with_parts else ((), NO_HULLS)
     return Solid(
         verts_obj=surface.verts_obj,
         faces=surface.faces,
@@ -107,27 +113,38 @@ def _distance_to(
 
 
 def _key(
-    verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"], config: PreparationConfig
+    verts: Float[np.ndarray, "vert 3"],
+    faces: Int[np.ndarray, "face 3"],
+    config: PreparationConfig,
+    with_parts: bool,
 ) -> str:
-    digest = hashlib.sha256(f"{CACHE_VERSION} {asdict(config)}".encode())
+    parameters = f"{asdict(config)}" if with_parts else f"{asdict(config.solid)} without parts"
+    digest = hashlib.sha256(f"{CACHE_VERSION} {parameters}".encode())
     digest.update(np.ascontiguousarray(verts, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(faces, dtype="<i8").tobytes())
     return digest.hexdigest()
 
 
-def cached_solid(mesh: ObjectMesh, config: PreparationConfig, cache_dir: Path, *, source: object) -> Solid:
+def cached_solid(
+    mesh: ObjectMesh,
+    config: PreparationConfig,
+    cache_dir: Path,
+    *,
+    source: object,
+    with_parts: bool = True,
+) -> Solid:
     """`make_solid`, kept in `cache_dir` under the hash of vertices, faces and parameters.
 
     A damaged entry is made again. Several processes may share the folder.
     """
-    path = cache_dir / f"{_key(mesh.verts_obj, mesh.faces, config)}.npz"
+    path = cache_dir / f"{_key(mesh.verts_obj, mesh.faces, config, with_parts)}.npz"
     if path.is_file():
         try:
             return solid_from_bytes(path.read_bytes())
         except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
             path.unlink(missing_ok=True)
     # Made from bytes in both cases, so the first load and later ones are equal to the bit.
-    data = solid_to_bytes(make_solid(mesh, config, source=source))
+    data = solid_to_bytes(make_solid(mesh, config, source=source, with_parts=with_parts))
     cache_dir.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".{os.getpid()}.partial")
     partial.write_bytes(data)
@@ -137,13 +154,16 @@ def cached_solid(mesh: ObjectMesh, config: PreparationConfig, cache_dir: Path, *
 
 def solid_to_bytes(solid: Solid) -> bytes:
     """An .npz with fixed dates: equal solids give equal bytes. Vertices are float32."""
+    no_verts, no_faces = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     arrays: dict[str, np.ndarray] = {
         "verts": solid.verts_obj.astype("<f4"),
         "faces": solid.faces.astype("<u2" if len(solid.verts_obj) < 65536 else "<u4"),
         "watertight_source": np.array(solid.watertight_source),
-        "part_verts": np.concatenate([part.verts_obj for part in solid.parts]).astype("<f4"),
-        "part_faces": np.concatenate([part.faces for part in solid.parts]).astype("<u2"),
-        "part_sizes": np.array([(len(p.verts_obj), len(p.faces)) for p in solid.parts], dtype="<u2"),
+        "part_verts": np.concatenate([no_verts, *(part.verts_obj for part in solid.parts)]).astype("<f4"),
+        "part_faces": np.concatenate([no_faces, *(part.faces for part in solid.parts)]).astype("<u2"),
+        "part_sizes": np.array(
+            [(len(part.verts_obj), len(part.faces)) for part in solid.parts], dtype="<u2"
+        ).reshape(-1, 2),
     }
     if solid.fit is not None:
         arrays["fit"] = np.array(list(asdict(solid.fit).values()), dtype="<f8")
@@ -159,13 +179,15 @@ def solid_to_bytes(solid: Solid) -> bytes:
 def solid_from_bytes(data: bytes) -> Solid:
     """Inverse of `solid_to_bytes` up to float32."""
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-        vert_ends = np.cumsum(arrays["part_sizes"][:, 0].astype(np.int64))[:-1]
-        face_ends = np.cumsum(arrays["part_sizes"][:, 1].astype(np.int64))[:-1]
+        part_verts, part_faces = arrays["part_verts"], arrays["part_faces"]
+        ends = np.cumsum(arrays["part_sizes"].astype(np.int64), axis=0)
+        starts = ends - arrays["part_sizes"]
         parts = tuple(
-            ConvexPart(verts_obj=verts.astype(np.float64), faces=faces.astype(np.int64))
-            for verts, faces in zip(
-                np.split(arrays["part_verts"], vert_ends), np.split(arrays["part_faces"], face_ends)
+            ConvexPart(
+                verts_obj=part_verts[start[0] : end[0]].astype(np.float64),
+                faces=part_faces[start[1] : end[1]].astype(np.int64),
             )
+            for start, end in zip(starts, ends)
         )
         return Solid(
             verts_obj=arrays["verts"].astype(np.float64),

@@ -14,6 +14,7 @@ from trimesh.visual import ColorVisuals
 from datagen.objects.errors import ObjectError
 from datagen.objects.file_mesh import FileMesh
 from datagen.objects.gltf import read_gltf
+from datagen.objects.gltf_file import MAX_FILE_MB
 from datagen.objects.mesh import Material, ObjectMesh
 from datagen.objects.surface import linear_from_srgb
 from datagen.objects.vertex_colors import baked_vertex_colors
@@ -36,6 +37,7 @@ class ReadingConfig:
     up_axis: Literal["y", "z"]  # of OBJ, PLY and STL; glTF is always Y-up
     max_faces: int  # more are refused
     max_image_px: int  # longer image sides are refused
+    max_file_mb: float = MAX_FILE_MB  # 10^6 bytes; larger files are refused before they are read
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,9 +55,17 @@ def read_object(path: Path, config: ReadingConfig) -> ReadObject:
         raise ObjectError(path, "does not exist", expected="a mesh file", action="Check the path.")
     if path.stat().st_size == 0:
         raise ObjectError(path, "is empty (0 bytes)", expected="a mesh", action="Copy the file again.")
+    if path.stat().st_size > config.max_file_mb * 1e6:
+        raise ObjectError(
+            path,
+            f"has {path.stat().st_size / 1e6:.0f} MB",
+            expected=f"at most {config.max_file_mb:g} MB",
+            action="Make the model smaller or raise `max_file_mb`.",
+        )
     suffix = path.suffix.lower()
     if suffix in GLTF_SUFFIXES:
-        return object_mesh(read_gltf(path, path.read_bytes()), path, config, unit="m", up_axis="y")
+        file_mesh = read_gltf(path, path.read_bytes(), max_file_mb=config.max_file_mb)
+        return object_mesh(file_mesh, path, config, unit="m", up_axis="y")
     if suffix == ".obj":
         file_mesh = read_obj(path)
     elif suffix in (".ply", ".stl"):
@@ -231,9 +241,10 @@ def _refuse_bad_images(material: Material, source: Path, config: ReadingConfig) 
             continue
         try:
             opened = Image.open(io.BytesIO(image))
-            opened.load()
             width, height = opened.size
-        except (UnidentifiedImageError, OSError) as error:
+            if max(width, height) <= config.max_image_px:  # larger ones are not even unpacked
+                opened.load()
+        except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
             raise ObjectError(
                 source,
                 f"an image of material {material.name!r} cannot be decoded ({error})",

@@ -38,6 +38,7 @@ class SampledMotion:
     hand_pose: Float[np.ndarray, "frame 45"]
     hand_translation_world: Float[np.ndarray, "frame 3"]
     betas: Float[np.ndarray, "beta"]
+    skin_model: str
     joints_world: Float[np.ndarray, "frame 21 3"]
     contact_force_n: Float[np.ndarray, "frame 5"]
     movement_rad: float  # of the object over the clip: turn + travel / 0.3 m
@@ -107,6 +108,7 @@ def sample_scene(
         hand_pose=sequence.hand_pose[frames],
         hand_translation_world=sequence.hand_translation_world[frames],
         betas=sequence.betas,
+        skin_model=skins.name,
         joints_world=placed.posed.joints_world,
         contact_force_n=sequence.contact_force_n[frames],
         movement_rad=placed.window.movement_rad,

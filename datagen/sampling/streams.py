@@ -21,6 +21,7 @@ class Stream(IntEnum):
     BACKGROUND = 9
     RENDER = 10
     TARGETS = 11
+    HAND_SIDE = 12
 
 
 def stream_rng(dataset_seed: int, motion_index: int, stream: Stream, *parts: int) -> np.random.Generator:

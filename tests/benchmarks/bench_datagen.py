@@ -77,9 +77,9 @@ def test_overhead_outside_cycles(tmp_path, say):
 def sampled_scene(folder: Path, config_path: Path) -> Scene:
     """The scene of the first motion of a configuration."""
     config = load_config(config_path)
-    plan = plan_dataset(config, folder / "data")
+    plan, _ = plan_dataset(config, folder / "data")
     job = Job(config=config, motion=plan.motions[0], out=folder / "data", device="cpu", threads=1)
-    asset = open_library(config.objects).load(job.motion.object_uid)
+    asset = open_library(config.objects, config.motions).load(job.motion.object_uid)
     return sampled_motion(job, asset, PhaseTimer()).scene
 
 

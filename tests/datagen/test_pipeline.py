@@ -38,6 +38,7 @@ def small_config(
     config["objects"] |= {"source": "folder", "path": str(meshes), "cache_dir": str(folder / "cache")}
     config["objects"]["reading"] |= {"unit": "m", "up_axis": "z"}
     config["plan"] = {"motions": motions, "motions_per_shard": motions}
+    config["selection"] |= {"licence_allow": ["NOASSERTION"]}
     config["sampling"]["clip"]["n_frames"] = frames
     config["sampling"]["cameras"] |= {"n_cameras": cameras, "image_size": [size, size]}
     config["sampling"]["render"] |= {"samples": 2, "max_bounces": 1, "denoise": False}
@@ -145,9 +146,8 @@ def flat_mesh(path: Path) -> None:
         ("flat.ply", flat_mesh),
     ],
 )
-def test_a_bad_object_is_one_line_and_the_other_motion_is_kept(name, write, tmp_path):
+def test_a_bad_object_is_one_line_before_anything_is_rendered(name, write, tmp_path):
     config = small_config(tmp_path)
-    (tmp_path / "meshes" / "can.ply").unlink()
     write(tmp_path / "meshes" / name)
     out = tmp_path / "out"
     run = subprocess.run(render_command(config, out), cwd=ROOT, capture_output=True, text=True)
@@ -156,7 +156,18 @@ def test_a_bad_object_is_one_line_and_the_other_motion_is_kept(name, write, tmp_
     assert len(message) == 1
     assert name in message[0]
     assert "Traceback" not in run.stderr
-    assert len(list(out.glob("staging/shard-00000/motion-*/motion.json"))) == 1
+    assert not (out / "plan.parquet").exists()
+
+
+def test_a_large_store_goes_on_without_its_bad_objects_and_says_so(tmp_path):
+    config = small_config(tmp_path)
+    (tmp_path / "meshes" / "empty.ply").write_bytes(b"")
+    settings = yaml.safe_load(config.read_text())
+    settings["selection"]["unusable"] = "remove"
+    config.write_text(yaml.safe_dump(settings))
+    result = CliRunner().invoke(main, ["plan", "--config", str(config), "--out", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert "selection: 2 of 3 motions kept; removed: 1 object cannot be used" in result.output
 
 
 @pytest.mark.slow

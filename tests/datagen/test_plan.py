@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from datagen.plan import Plan, PlanConfig, PlanError, make_plan, read_plan, same_plan, write_plan
+from datagen.plan import Candidate, Plan, PlanConfig, PlanError, make_plan, read_plan, same_plan, write_plan
 from shards.splits import SplitRule, split_of_object
 
 UIDS = [f"starter/object-{i}" for i in range(7)]
@@ -18,7 +18,8 @@ def plan_of(motions: int, per_shard: int, *, seed: int = 0, uids: list[str] = UI
     return make_plan(
         PlanConfig(motions=motions, motions_per_shard=per_shard),
         dataset_seed=seed,
-        object_uids=uids,
+        candidates=[Candidate(object_uid=uid, sequence_id="") for uid in uids],
+        left_probability=0.0,
         split_rule=RULE,
         n_cameras=4,
         n_frames=12,
@@ -75,6 +76,6 @@ def test_damaged_or_missing_plan_is_one_clear_error(tmp_path):
         read_plan(path)
 
 
-def test_empty_library_is_refused():
-    with pytest.raises(PlanError, match="library is empty"):
+def test_an_empty_selection_is_refused():
+    with pytest.raises(PlanError, match="nothing to plan"):
         plan_of(8, 2, uids=[])

@@ -18,6 +18,7 @@ QUALITY = GraspQuality(
     slip_manipulation_m=0.001,
     contact_force_n=10.0,
     attempts=1,
+    digit_distance_m=np.zeros(5),
 )
 
 

@@ -1,15 +1,10 @@
 """The hand's forward model against independent implementations and its own symmetries."""
 
-import pickle
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Float
-from scipy import sparse
 from scipy.spatial.transform import Rotation
 
 from datagen.hands.model import (
@@ -143,51 +138,6 @@ def test_mirroring_twice_gives_the_same_hand() -> None:
 def test_too_many_shape_coefficients_are_refused() -> None:
     with pytest.raises(ValueError, match="has 10 shape coefficients, found 11"):
         shape_hand(load_open_hand(), np.zeros(11))
-
-
-@pytest.mark.slow
-def test_equals_smplx_on_a_model_in_the_official_layout(tmp_path: Path) -> None:
-    smplx = pytest.importorskip("smplx", reason="smplx is not installed")
-    import torch
-
-    model = replace(load_open_hand(), name="official layout")
-    path = tmp_path / "MANO_RIGHT.pkl"
-    _write_official_pickle(model, path)
-    layer = smplx.MANO(str(path), use_pca=False, flat_hand_mean=False, is_rhand=True, batch_size=2).double()
-    # smplx keeps single precision copies of the arrays; the parameters are doubles.
-    hand, pose = random_shape(6, model), random_pose(7)
-    ours = pose_hand(hand, **pose, flat_hand_mean=False)
-    with torch.no_grad():
-        theirs = layer(
-            betas=torch.tensor(hand.betas)[None].repeat(2, 1),
-            global_orient=torch.tensor(pose["orientation_world"]),
-            hand_pose=torch.tensor(pose["hand_pose"]),
-            transl=torch.tensor(pose["translation_world"]),
-        )
-    np.testing.assert_allclose(ours.verts_world, theirs.vertices.numpy(), atol=1e-6)
-    np.testing.assert_allclose(ours.joints_world[:, :16], theirs.joints.numpy()[:, :16], atol=1e-6)
-
-
-def _write_official_pickle(model: HandModel, path: Path) -> None:
-    parents = np.array(PARENTS, dtype=np.int64)
-    parents[0] = 4294967295
-    data = {
-        "v_template": model.v_template,
-        "shapedirs": model.shapedirs,
-        "posedirs": model.posedirs,
-        "J_regressor": sparse.csc_matrix(model.J_regressor),
-        "J": model.J_regressor @ model.v_template,
-        "weights": model.weights,
-        "f": model.faces.astype(np.uint32),
-        "kintree_table": np.stack([parents, np.arange(16)]),
-        "hands_mean": model.hands_mean,
-        "hands_components": np.eye(45),
-        "hands_coeffs": np.zeros((1, 45)),
-        "bs_style": "lbs",
-        "bs_type": "lrotmin",
-    }
-    with path.open("wb") as file:
-        pickle.dump(data, file, protocol=2)
 
 
 def _assert_same(a: PosedHand, b: PosedHand) -> None:

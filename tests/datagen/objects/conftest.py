@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from datagen.objects.convex import ConvexConfig
 from datagen.objects.level_set import LevelSetConfig
 from datagen.objects.mesh import Material, ObjectMesh
+from datagen.objects.preparation import PreparationConfig
 from datagen.objects.solids import SolidConfig
 
 Surface = tuple[np.ndarray, np.ndarray]
@@ -19,6 +21,22 @@ def solid_config() -> SolidConfig:
         tolerance_m=5e-5,
         max_faces=12000,
     )
+
+
+@pytest.fixture
+def quick_preparation(solid_config: SolidConfig) -> PreparationConfig:
+    """One coarse convex part: for tests that are about loading."""
+    convex = ConvexConfig(
+        thresholds=(0.5,),
+        max_hulls=1,
+        max_hull_verts=32,
+        hull_tolerance_m=0.001,
+        max_excess_m=1.0,
+        max_faces=500,
+        mcts_iterations=5,
+        seed=0,
+    )
+    return PreparationConfig(solid=solid_config, convex=convex)
 
 
 @pytest.fixture

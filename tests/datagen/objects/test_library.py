@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from datagen.objects.convex import ConvexConfig
 from datagen.objects.errors import ObjectError
 from datagen.objects.holdable import HOLDABLE_SIDES_M, holdable_scale
 from datagen.objects.library import REFERENCE_READING, MeshFolder, StarterPack, Sweethome3D
-from datagen.objects.preparation import PreparationConfig
 
 GRASPXL = Path("/work/shared/graspxl_sample/object_dataset/large")
 DATA = files("datagen.objects").joinpath("data")
@@ -26,22 +24,6 @@ def pack() -> StarterPack:
 @pytest.fixture(scope="module")
 def assets(pack):
     return [pack.load(uid) for uid in pack.uids()]
-
-
-@pytest.fixture
-def quick(solid_config) -> PreparationConfig:
-    """One coarse convex part: these tests are about loading."""
-    convex = ConvexConfig(
-        thresholds=(0.5,),
-        max_hulls=1,
-        max_hull_verts=32,
-        hull_tolerance_m=0.001,
-        max_excess_m=1.0,
-        max_faces=500,
-        mcts_iterations=5,
-        seed=0,
-    )
-    return PreparationConfig(solid=solid_config, convex=convex)
 
 
 def test_there_are_forty_objects_or_more(pack):
@@ -104,6 +86,14 @@ def test_textures_are_kept(assets):
     assert any(material.metallic > 0 for asset in assets for material in asset.mesh.materials)
 
 
+def test_description_and_texture_agree_with_the_loaded_object(pack, assets):
+    for asset in assets[:5]:
+        assert pack.describe(asset.uid).licence == asset.licence
+        assert pack.texture_quality(asset.uid) == asset.texture
+    with pytest.raises(ObjectError, match="has no object"):
+        pack.describe("starter/moon")
+
+
 def test_loading_is_deterministic(pack):
     first, second = pack.load("starter/milk"), StarterPack().load("starter/milk")
     np.testing.assert_array_equal(first.mesh.verts_obj, second.mesh.verts_obj)
@@ -123,33 +113,35 @@ def test_miniature_rule(size_m, scale):
     assert holdable_scale(np.array(size_m)) == pytest.approx(scale)
 
 
-def test_folder_loads_notes_and_caches(tmp_path, quick):
+def test_folder_loads_notes_and_caches(tmp_path, quick_preparation):
     folder, cache = tmp_path / "meshes", tmp_path / "cache"
     (folder / "deep").mkdir(parents=True)
     trimesh.creation.box((10, 8, 6)).export(folder / "deep" / "box.stl")
     (folder / "objects.csv").write_text(
         "path,name,licence,author,url\ndeep/box.stl,Box,CC0-1.0,Ann,http://x\n"
     )
-    library = MeshFolder(folder, REFERENCE_READING, quick, cache)
+    library = MeshFolder(folder, REFERENCE_READING, quick_preparation, cache)
     assert library.uids() == ("folder/deep/box.stl",)
     first = library.load("folder/deep/box.stl")
     assert (first.name, first.licence, first.author) == ("Box", "CC0-1.0", "Ann")
+    assert library.describe("folder/deep/box.stl").licence == "CC0-1.0"
+    assert library.texture_quality("folder/deep/box.stl") == first.texture
     np.testing.assert_allclose(np.ptp(first.mesh.verts_obj, axis=0), [0.10, 0.06, 0.08])
     again = library.load("folder/deep/box.stl")
     np.testing.assert_array_equal(first.solid.verts_obj, again.solid.verts_obj)
     assert len(list(cache.iterdir())) == 1
 
 
-def test_empty_folder_is_refused(tmp_path, quick):
+def test_empty_folder_is_refused(tmp_path, quick_preparation):
     with pytest.raises(ObjectError, match="holds no meshes"):
-        MeshFolder(tmp_path, REFERENCE_READING, quick, tmp_path)
+        MeshFolder(tmp_path, REFERENCE_READING, quick_preparation, tmp_path)
     with pytest.raises(ObjectError, match="is not a folder"):
-        MeshFolder(tmp_path / "none", REFERENCE_READING, quick, tmp_path)
+        MeshFolder(tmp_path / "none", REFERENCE_READING, quick_preparation, tmp_path)
 
 
 @pytest.mark.skipif(not GRASPXL.is_dir(), reason="the GraspXL sample is not here")
-def test_graspxl_meshes_load_as_a_folder(tmp_path, quick):
-    library = MeshFolder(GRASPXL, REFERENCE_READING, quick, tmp_path)
+def test_graspxl_meshes_load_as_a_folder(tmp_path, quick_preparation):
+    library = MeshFolder(GRASPXL, REFERENCE_READING, quick_preparation, tmp_path)
     assert len(library.uids()) == 20
     for uid in library.uids()[::5]:
         asset = library.load(uid)
@@ -158,12 +150,12 @@ def test_graspxl_meshes_load_as_a_folder(tmp_path, quick):
         assert 0.06 < np.ptp(asset.mesh.verts_obj, axis=0).min() < 0.09
 
 
-def test_absent_debian_library_says_how_to_get_it(tmp_path, quick):
+def test_absent_debian_library_says_how_to_get_it(tmp_path, quick_preparation):
     with pytest.raises(ObjectError, match="apt-get install sweethome3d-furniture"):
-        Sweethome3D(tmp_path, quick, tmp_path)
+        Sweethome3D(tmp_path, quick_preparation, tmp_path)
 
 
-def test_debian_library_reads_catalogue_models(tmp_path, quick):
+def test_debian_library_reads_catalogue_models(tmp_path, quick_preparation):
     """A library in miniature: Y-up model, rotation, catalogue size, fixtures and furniture left out."""
     box = trimesh.creation.box((1, 2, 3))
     entries = {
@@ -181,9 +173,11 @@ def test_debian_library_reads_catalogue_models(tmp_path, quick):
         archive.writestr("PluginFurnitureCatalog.properties", "\n".join([*lines, "creator#1=Ann\\u00e9"]))
         for _, model, *_ in entries.values():
             archive.writestr(model, box.export(file_type="obj"))
-    library = Sweethome3D(tmp_path, quick, tmp_path / "cache")
+    library = Sweethome3D(tmp_path, quick_preparation, tmp_path / "cache")
     assert library.uids() == ("sweethome3d/BlendSwap-CC-0/box",)
     asset = library.load(library.uids()[0])
     assert (asset.licence, asset.author) == ("CC0-1.0", "Anné")
+    assert library.describe(asset.uid).licence == asset.licence
+    assert library.texture_quality(asset.uid) == asset.texture
     assert asset.catalogue_scale == pytest.approx(0.7)  # the middle side, 20 cm, is the limit
     np.testing.assert_allclose(np.ptp(asset.mesh.verts_obj, axis=0), [0.07, 0.14, 0.21], rtol=1e-6)

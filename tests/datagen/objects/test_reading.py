@@ -178,9 +178,9 @@ BAD = {
     "huge image": (with_image(png(size=(300, 8))), "is 300x8"),
     "skinned": (write("a.glb", glb({**MESH, "skins": [{}]}, TRIANGLE)), "is skinned"),
     "animated": (write("a.glb", glb({**MESH, "animations": [{}]}, TRIANGLE)), "is animated"),
-    "draco": (
-        write("a.glb", glb({**MESH, "extensionsRequired": ["KHR_draco_mesh_compression"]}, TRIANGLE)),
-        "is compressed with KHR_draco",
+    "meshopt": (
+        write("a.glb", glb({**MESH, "extensionsRequired": ["EXT_meshopt_compression"]}, TRIANGLE)),
+        "requires EXT_meshopt_compression",
     ),
     "cut short": (write("a.glb", glb(MESH, TRIANGLE)[:-20]), "is cut short"),
     "buffer too small": (write("a.glb", glb(MESH, TRIANGLE[:20])), "reaches beyond"),

@@ -201,6 +201,7 @@ def make_sequence(hand):
                 slip_manipulation_m=0.0,
                 contact_force_n=5.0,
                 attempts=1,
+                digit_distance_m=np.zeros(5),
             ),
             start=start,
             table_edge=edge,

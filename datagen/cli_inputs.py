@@ -1,0 +1,150 @@
+"""Commands about what goes in: `datagen assets`, `datagen select`, `datagen grasps`."""
+
+import time
+from pathlib import Path
+
+import click
+import numpy as np
+from rich.console import Console
+
+from datagen.asset_states import asset_states
+from datagen.cli_options import (
+    config_option,
+    default_out,
+    license_option,
+    out_option,
+    plain_errors,
+    workers_option,
+)
+from datagen.config import DatasetConfig, load_config
+from datagen.grasps.graspxl import SequenceFile, read_sequence
+from datagen.grasps.replay import ReplayError, replay
+from datagen.grasps.replay_report import ReplayOutcome
+from datagen.grasps.report import GraspReport, summarise
+from datagen.grasps.synthesise import GraspAttemptReport, synthesise_grasp
+from datagen.hand_source import open_hand
+from datagen.hands.model import shape_hand
+from datagen.inspection.asset_table import asset_table
+from datagen.inspection.grasp_table import grasp_table
+from datagen.inspection.replay_table import replay_table
+from datagen.inspection.selection_table import selection_table
+from datagen.library import open_library
+from datagen.motion_source import recorded_sequences
+from datagen.sampling.streams import Stream, stream_rng
+from datagen.select_motions import SELECTION_FILE, select_motions
+from datagen.selection_progress import SelectionProgress
+
+__all__ = ["assets", "grasps", "select"]
+
+
+@click.command()
+@config_option
+@plain_errors
+def assets(config_path: Path) -> None:
+    """List every open and licensed input: whether it is there, its version and licence, how to get it.
+
+    \b
+    Example:
+      datagen assets --config configs/datagen/graspxl.yaml
+    """
+    Console().print(asset_table(asset_states(load_config(config_path))))
+
+
+@click.command()
+@config_option
+@out_option
+@license_option
+@workers_option
+@plain_errors
+def select(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
+    """Decide which motions are worth rendering; print how many each rule removes, write the reasons.
+
+    \b
+    Example:
+      datagen select --config configs/datagen/small.yaml --license-allow cc0,by
+    """
+    config = load_config(config_path, licence_allow=licence_allow)
+    out = out or default_out(config_path)
+    with SelectionProgress() as bar:
+        selection = select_motions(config, out, workers=workers, report=bar.update)
+    console = Console()
+    console.print(selection_table(selection.decisions))
+    console.print(f"every decision with its reason and figures: {out / SELECTION_FILE}")
+
+
+@click.command()
+@config_option
+@click.option(
+    "--object", "objects", multiple=True, help="Only this object (may be repeated).  [default: all]"
+)
+@click.option(
+    "--motions",
+    type=click.IntRange(min=1),
+    default=None,
+    help="Motions per object.  [default: 1 simulated, or all recorded]",
+)
+@plain_errors
+def grasps(config_path: Path, objects: tuple[str, ...], motions: int | None) -> None:
+    """Simulate or replay grasps without rendering; print success, contact distances and quality.
+
+    \b
+    Example:
+      datagen grasps --object starter/milk --motions 3
+    """
+    config = load_config(config_path)
+    with SelectionProgress("grasping") as bar:
+        if config.motions.source == "simulated":
+            table = grasp_table(_simulated(config, objects, motions or 1, bar))
+        else:
+            table = replay_table(_replayed(config, objects, motions, bar))
+    Console().print(table)
+
+
+def _simulated(
+    config: DatasetConfig, objects: tuple[str, ...], motions: int, bar: SelectionProgress
+) -> GraspReport:
+    library = open_library(config.objects, config.motions)
+    uids = objects or tuple(uid for uid in library.uids() if uid not in config.objects.exclude)
+    hand = shape_hand(open_hand(config.hand).right, np.zeros(config.sampling.appearance.n_betas))
+    reports: list[GraspAttemptReport] = []
+    for number, uid in enumerate(uids):
+        asset = library.load(uid)
+        for motion in range(motions):
+            bar.update(len(reports), len(uids) * motions, uid)
+            rng = stream_rng(config.seed, number, Stream.GRASP, 1 + motion)
+            reports.append(synthesise_grasp(hand, asset, config.grasp, rng))
+    return summarise(reports)
+
+
+def _replayed(
+    config: DatasetConfig, objects: tuple[str, ...], motions: int | None, bar: SelectionProgress
+) -> list[ReplayOutcome]:
+    files = list(recorded_sequences(config.motions).values())
+    if objects:
+        files = [file for file in files if file.object_uid in objects]
+    of_object: dict[str, list[SequenceFile]] = {}
+    for file in files:
+        of_object.setdefault(file.object_uid, []).append(file)
+    chosen = [file for group in of_object.values() for file in group[:motions]]
+    library = open_library(config.objects, config.motions)
+    model = open_hand(config.hand).right
+    hand = shape_hand(model, np.zeros(model.shapedirs.shape[2]))
+    outcomes: list[ReplayOutcome] = []
+    for file in chosen:
+        bar.update(len(outcomes), len(chosen), file.sequence_id)
+        asset = library.load(file.object_uid)
+        recorded = read_sequence(file)
+        began = time.process_time()
+        try:
+            made, reason = replay(recorded, hand, asset, config.motions.replay), ""
+        except ReplayError as error:
+            made, reason = None, str(error)
+        outcomes.append(
+            ReplayOutcome(
+                sequence_id=file.sequence_id,
+                sequence=made,
+                reason=reason,
+                cpu_seconds=time.process_time() - began,
+            )
+        )
+    return outcomes

@@ -1,0 +1,226 @@
+"""Objaverse 1.0 as its own package `objaverse` stores it on disk. Nothing is downloaded here.
+
+    <root>/glbs/000-xxx/<uid>.glb        the models; "<uid>.glb.tmp" while one is being downloaded
+    <root>/metadata/000-xxx.json.gz      Sketchfab's record of each uid of that folder
+    <root>/object-paths.json.gz          uid -> "glbs/000-xxx/<uid>.glb", of all 798,759
+    <root>/lvis-annotations.json.gz      LVIS category -> uids
+
+Source: github.com/allenai/objaverse-xl, objaverse/__init__.py. All but the models may be absent.
+"""
+
+import gzip
+import json
+import os
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from datagen.objects.asset import ObjectAsset
+from datagen.objects.description import ObjectDescription
+from datagen.objects.errors import ObjectError
+from datagen.objects.holdable import fitted_scale, scaled_mesh
+from datagen.objects.licences import UNKNOWN_LICENCE
+from datagen.objects.mesh import ObjectMesh
+from datagen.objects.objaverse_annotation import ObjaverseAnnotation, annotation_of_record
+from datagen.objects.orientation import outward_mesh
+from datagen.objects.preparation import PreparationConfig, cached_solid
+from datagen.objects.reading import ReadingConfig, ReadObject, read_object
+from datagen.objects.texture_quality import TextureQuality, measure_texture_quality
+
+__all__ = ["ObjaverseAnnotation", "ObjaverseStore", "objaverse_root"]
+
+DEFAULT_ROOT = Path("~/.objaverse/hf-objaverse-v1")
+ROOT_VARIABLE = "OBJAVERSE"
+DOWNLOAD = "Download with `objaverse.load_objects(uids)` of the Python package objaverse"
+
+
+class ObjaverseStore:
+    """The models on disk; uid "objaverse/<Objaverse uid>".
+
+    Sizes in Objaverse mean nothing. Each model is scaled until its bbox is as large as one hand
+    holds (`fitted_scale`: smallest side up to 7.5 cm, as in GraspXL's "large" set);
+    `catalogue_scale` records the factor.
+    """
+
+    def __init__(
+        self, root: Path | None, reading: ReadingConfig, preparation: PreparationConfig, cache_dir: Path
+    ) -> None:
+        self._root, self._origin = _opened_root(root)
+        self._reading, self._preparation = reading, preparation
+        self._cache_dir = cache_dir.expanduser()
+        self._folders = _models_on_disk(self._root, self._origin)
+        self._records: dict[str, dict[str, Any]] = {}  # by folder, read when first asked for
+        self._paths: dict[str, str] | None = None
+        self._categories: dict[str, str] | None = None
+
+    @property
+    def root(self) -> Path:
+        """The folder in use, holding `glbs`."""
+        return self._root
+
+    def uids(self) -> tuple[str, ...]:
+        """ "objaverse/<uid>" of every model on disk, sorted."""
+        return tuple(f"objaverse/{uid}" for uid in self._folders)
+
+    def holds(self, uid: str) -> bool:
+        """Whether the model is on disk completely."""
+        return _plain(uid) in self._folders
+
+    def glb_path(self, uid: str) -> Path:
+        """The model's file. ObjectError where it is absent or only partly downloaded."""
+        plain = _plain(uid)
+        if plain in self._folders:
+            return self._root / "glbs" / self._folders[plain] / f"{plain}.glb"
+        if any((self._root / "glbs").glob(f"*/{plain}.glb.tmp")):
+            raise ObjectError(
+                self._root,
+                f"object {uid!r} is only partly downloaded ({plain}.glb.tmp)",
+                expected=f"{plain}.glb",
+                action=f"{DOWNLOAD} again.",
+            )
+        raise ObjectError(
+            self._root,
+            f"has no object {uid!r} (folder chosen by {self._origin})",
+            expected="one of its uids()",
+            action=f"{DOWNLOAD}, or pick another uid.",
+        )
+
+    def load(self, uid: str) -> ObjectAsset:
+        """Read, scale, repair and prepare one model; solids come from the cache the second time."""
+        path = self.glb_path(uid)
+        read, factor, mesh = self._read(path)
+        note = self.annotation(uid)
+        return ObjectAsset(
+            uid=f"objaverse/{_plain(uid)}",
+            name=(note and note.name) or _plain(uid),
+            source="objaverse",
+            licence=note.licence if note else UNKNOWN_LICENCE,
+            author=(note and note.author) or "unknown",
+            url=(note and note.url) or "",
+            mesh=mesh,
+            solid=cached_solid(mesh, self._preparation, self._cache_dir, source=path),
+            catalogue_scale=factor,
+            texture=measure_texture_quality(mesh),
+            T_obj_from_file=np.diag([factor, factor, factor, 1.0]) @ read.T_obj_from_file,
+        )
+
+    def describe(self, uid: str) -> ObjectDescription:
+        """Licence and annotation, without reading the model."""
+        self.glb_path(uid)  # names what is not there
+        note = self.annotation(uid)
+        return ObjectDescription(licence=note.licence if note else UNKNOWN_LICENCE, annotation=note)
+
+    def texture_quality(self, uid: str) -> TextureQuality:
+        """As `load` measures it, without making the solid."""
+        return measure_texture_quality(self._read(self.glb_path(uid))[2])
+
+    def _read(self, path: Path) -> tuple[ReadObject, float, ObjectMesh]:
+        """The file, its scale, and the drawn mesh at that scale."""
+        read = read_object(path, self._reading)
+        factor = fitted_scale(np.ptp(read.mesh.verts_obj, axis=0))
+        return read, factor, outward_mesh(scaled_mesh(read.mesh, factor))
+
+    def annotation(self, uid: str) -> ObjaverseAnnotation | None:
+        """The metadata of one model, on disk or not; None where they are not on disk.
+
+        Files are read once per instance. ObjectError where one is damaged.
+        """
+        plain = _plain(uid)
+        folder = self._folders.get(plain) or self._folder_of_path(plain)
+        if folder is None:
+            return None
+        if folder not in self._records:
+            self._records[folder] = _gzipped_json(self._root / "metadata" / f"{folder}.json.gz")
+        record = self._records[folder].get(plain)
+        return None if record is None else annotation_of_record(record, self._category(plain))
+
+    def _folder_of_path(self, plain: str) -> str | None:
+        if self._paths is None:
+            self._paths = _gzipped_json(self._root / "object-paths.json.gz")
+        path = self._paths.get(plain)
+        return None if path is None else Path(path).parent.name
+
+    def _category(self, plain: str) -> str | None:
+        if self._categories is None:
+            lvis = _gzipped_json(self._root / "lvis-annotations.json.gz")
+            self._categories = {uid: category for category, uids in lvis.items() for uid in uids}
+        return self._categories.get(plain)
+
+
+def _plain(uid: str) -> str:
+    return uid.removeprefix("objaverse/")
+
+
+def objaverse_root(root: Path | None) -> Path:
+    """The folder that is looked at: `root`, else $OBJAVERSE, else the default; it need not exist."""
+    return _chosen_root(root)[0]
+
+
+def _chosen_root(root: Path | None) -> tuple[Path, str]:
+    """The store's folder, and what chose it."""
+    if root is not None:
+        chosen, origin = root, "the path in the configuration"
+    elif os.environ.get(ROOT_VARIABLE):
+        chosen, origin = Path(os.environ[ROOT_VARIABLE]), f"${ROOT_VARIABLE}"
+    else:
+        chosen, origin = DEFAULT_ROOT, f"the default, as ${ROOT_VARIABLE} is not set"
+    chosen = chosen.expanduser()
+    # ~/.objaverse itself is understood too.
+    return (chosen / DEFAULT_ROOT.name if (chosen / DEFAULT_ROOT.name).is_dir() else chosen), origin
+
+
+def _opened_root(root: Path | None) -> tuple[Path, str]:
+    """The folder that holds `glbs`, and what chose it. ObjectError where there is none."""
+    chosen, origin = _chosen_root(root)
+    if (chosen / "glbs").is_dir():
+        return chosen, origin
+    raise ObjectError(
+        chosen,
+        f"{'holds no folder `glbs`' if chosen.is_dir() else 'is not a folder'} (chosen by {origin})",
+        expected="the store of the Python package objaverse, usually ~/.objaverse/hf-objaverse-v1",
+        action=f"{DOWNLOAD}, or set the path or ${ROOT_VARIABLE}.",
+    )
+
+
+def _models_on_disk(root: Path, origin: str) -> dict[str, str]:
+    """Folder of every completely downloaded model, by uid, sorted."""
+    found = {
+        entry.name.removesuffix(".glb"): folder.name
+        for folder in os.scandir(root / "glbs")
+        if folder.is_dir()
+        for entry in os.scandir(folder)
+        if entry.name.endswith(".glb") and entry.is_file()
+    }
+    if not found:
+        raise ObjectError(
+            root / "glbs",
+            f"holds no models (chosen by {origin})",
+            expected="000-xxx/<uid>.glb",
+            action=f"{DOWNLOAD}.",
+        )
+    return dict(sorted(found.items()))
+
+
+def _gzipped_json(path: Path) -> dict[str, Any]:
+    """A mapping; empty where the file is absent. ObjectError where it is damaged."""
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(gzip.decompress(path.read_bytes()))
+    except (OSError, EOFError, ValueError, zlib.error) as error:
+        raise ObjectError(
+            path,
+            f"cannot be unpacked ({type(error).__name__}: {error})",
+            expected="gzipped JSON, as Objaverse publishes it",
+            action="Delete the file and download it again with the Python package objaverse.",
+        ) from error
+    if not isinstance(content, dict):
+        raise ObjectError(
+            path,
+            f"holds a {type(content).__name__}",
+            expected="a mapping, as Objaverse publishes it",
+            action="Delete the file and download it again with the Python package objaverse.",
+        )
+    return content

@@ -1,0 +1,213 @@
+"""GraspXL's object_dataset, with and without the textured originals."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from datagen.objects.errors import ObjectError
+from datagen.objects.graspxl_objects import GraspXLObjects
+from datagen.objects.library import REFERENCE_READING, ObjectLibrary
+from datagen.objects.mesh import ObjectMesh
+from datagen.objects.mirror import mirrored_asset
+from datagen.objects.objaverse import ObjaverseStore
+from datagen.objects.plain_look import LOOKS, with_plain_look
+from datagen.objects.preparation import make_solid, solid_from_bytes, solid_to_bytes
+from datagen.objects.registration import REFERENCE_REGISTRATION
+from datagen.objects.surface import sample_surface
+from tests.datagen.grasps.graspxl_sample import SAMPLE, needs_sample
+from tests.datagen.objects.official_files import (
+    MODELS,
+    objaverse_id,
+    write_graspxl_objects,
+    write_objaverse_store,
+)
+
+BREAD = objaverse_id("starter/bread")
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return write_graspxl_objects(tmp_path_factory.mktemp("graspxl"), sizes=("small", "large"))
+
+
+@pytest.fixture(scope="module")
+def store_root(tmp_path_factory):
+    return write_objaverse_store(tmp_path_factory.mktemp("store"))
+
+
+@pytest.fixture
+def opened(quick_preparation, tmp_path):
+    def make(root, store_root=None, textures="when_present") -> GraspXLObjects:
+        cache = tmp_path / "cache"
+        store = store_root and ObjaverseStore(store_root, REFERENCE_READING, quick_preparation, cache)
+        return GraspXLObjects(
+            root,
+            store,
+            textures=textures,
+            reading=REFERENCE_READING,
+            preparation=quick_preparation,
+            registration=REFERENCE_REGISTRATION,
+            cache_dir=cache,
+        )
+
+    return make
+
+
+def test_objects_are_listed_by_size(opened, root):
+    library = opened(root)
+    assert isinstance(library, ObjectLibrary)
+    assert len(library.uids()) == 2 * len(MODELS)
+    assert f"objaverse/{BREAD}@small" in library.uids()
+    assert [uid.partition("@")[2] for uid in library.uids()] == ["small"] * 3 + ["large"] * 3
+
+
+@pytest.mark.parametrize("above", ["", "dataset_example", "object_dataset"])
+def test_root_may_be_above_or_below(opened, root, tmp_path, above):
+    """As published, inside dataset_example, unzipped into a folder of its own name, or the folder itself."""
+    moved = tmp_path / "data" / above
+    moved.mkdir(parents=True)
+    (moved / "object_dataset").symlink_to(root / "object_dataset")
+    assert opened(tmp_path / "data").uids() == opened(root).uids()
+    assert opened(root / "object_dataset").uids() == opened(root).uids()
+
+
+def test_untextured_object_stays_in_the_frame_of_the_poses(opened, root):
+    asset = opened(root).load(f"objaverse/{BREAD}@large")
+    file = trimesh.load(root / "object_dataset" / "large" / BREAD / f"{BREAD}.obj", process=False)
+    np.testing.assert_allclose(asset.T_obj_from_file[:3, :3], np.eye(3))
+    there = file.vertices @ asset.T_obj_from_file[:3, :3].T + asset.T_obj_from_file[:3, 3]
+    np.testing.assert_allclose(
+        np.sort(asset.mesh.verts_obj, axis=0), np.sort(np.unique(there, axis=0), axis=0), atol=1e-9
+    )
+    assert np.ptp(asset.mesh.verts_obj, axis=0).min() == pytest.approx(0.075, rel=1e-5)
+    assert (asset.licence, asset.source) == ("CC-BY-NC-4.0", "graspxl")
+    assert asset.texture.texture_resolution_px == 0
+    assert asset.registration is None
+    assert asset.solid.parts == ()
+    assert asset.solid.fit is not None
+    assert np.isnan(asset.solid.fit.hull_excess_max_m)
+
+
+def test_textured_original_is_drawn_in_place(opened, root, store_root):
+    plain = opened(root).load(f"objaverse/{BREAD}@large")
+    asset = opened(root, store_root).load(f"objaverse/{BREAD}@large")
+    assert asset.registration is not None
+    assert asset.registration.residual < 1e-4
+    np.testing.assert_allclose(  # the same place, size and frame
+        np.sort(asset.mesh.verts_obj, axis=0)[[0, -1]],
+        np.sort(plain.mesh.verts_obj, axis=0)[[0, -1]],
+        atol=1e-5,
+    )
+    np.testing.assert_array_equal(asset.T_obj_from_file, plain.T_obj_from_file)
+    assert asset.texture.texture_resolution_px > 100
+    assert (asset.licence, asset.author, asset.name) == ("CC-BY-4.0", "Ann Modeller", "Bread")
+
+
+def test_description_and_texture_agree_with_the_loaded_object(opened, root, store_root):
+    uid = f"objaverse/{BREAD}@large"
+    for library in (opened(root), opened(root, store_root)):
+        asset = library.load(uid)
+        assert library.describe(uid).licence == asset.licence
+        assert (library.describe(uid).annotation is None) == (asset.registration is None)
+        assert library.texture_quality(uid) == asset.texture
+
+
+def test_mirrored_textured_object_keeps_its_registration_consistent(opened, root, store_root):
+    asset = opened(root, store_root).load(f"objaverse/{BREAD}@large")
+    image = mirrored_asset(asset)
+    assert image.uid == f"objaverse/{BREAD}@large-mirrored"
+    T = image.registration.T_rescaled_from_original
+    np.testing.assert_array_equal(T[0], -asset.registration.T_rescaled_from_original[0])
+    twice = mirrored_asset(image).registration.T_rescaled_from_original
+    np.testing.assert_array_equal(twice, asset.registration.T_rescaled_from_original)
+
+
+def test_textures_none_leaves_the_store_alone(opened, root, store_root):
+    asset = opened(root, store_root, "none").load(f"objaverse/{BREAD}@small")
+    assert (asset.registration, asset.licence) == (None, "CC-BY-NC-4.0")
+
+
+def test_textures_required(opened, root, tmp_path):
+    with pytest.raises(ObjectError, match="there is no Objaverse store"):
+        opened(root, None, "required")
+    some = write_objaverse_store(tmp_path / "some", MODELS[:1])
+    assert opened(root, some, "required").uids() == (f"objaverse/{BREAD}@small", f"objaverse/{BREAD}@large")
+    other = write_objaverse_store(tmp_path / "other", ("starter/milk",))
+    with pytest.raises(ObjectError, match="holds the textured model of none"):
+        opened(root, other, "required")
+
+
+def test_model_of_another_object_is_refused(opened, root, tmp_path):
+    store = write_objaverse_store(tmp_path / "s", ("starter/rock_b", "starter/bread"))
+    rock = store / "glbs" / "000-000" / f"{objaverse_id('starter/rock_b')}.glb"
+    rock.rename(rock.with_name(f"{objaverse_id('starter/rock_a')}.glb"))
+    uid = f"objaverse/{objaverse_id('starter/rock_a')}@large"
+    with pytest.raises(ObjectError, match=r"\.glb: (does not match|has other proportions)"):
+        opened(root, store).load(uid)
+
+
+def test_wrong_places_are_named(opened, tmp_path, monkeypatch):
+    monkeypatch.delenv("GRASPXL", raising=False)
+    with pytest.raises(ObjectError, match="neither a path nor"):
+        opened(None)
+    with pytest.raises(ObjectError, match="is not a folder"):
+        opened(tmp_path / "none")
+    with pytest.raises(ObjectError, match="holds no GraspXL objects"):
+        opened(tmp_path)
+    (tmp_path / "large" / "abc").mkdir(parents=True)  # motions, not meshes
+    with pytest.raises(ObjectError, match=r"holds no <id>/<id>\.obj"):
+        opened(tmp_path)
+
+
+def test_unknown_uid_is_named(opened, root):
+    with pytest.raises(ObjectError, match="there is no object 'objaverse/x@large'"):
+        opened(root).load("objaverse/x@large")
+
+
+def test_solid_without_parts_keeps_its_bytes(box, plain_mesh, quick_preparation):
+    solid = make_solid(plain_mesh(*box), quick_preparation, source="box", with_parts=False)
+    data = solid_to_bytes(solid)
+    again = solid_from_bytes(data)
+    assert again.parts == ()
+    assert solid_to_bytes(again) == data
+
+
+def test_looks_differ_by_name_and_stay_for_one(box, plain_mesh):
+    mesh: ObjectMesh = plain_mesh(*box)
+    dressed = [with_plain_look(mesh, f"object {k}") for k in range(60)]
+    assert len({one.materials[0].name for one in dressed}) == len(LOOKS)
+    assert with_plain_look(mesh, "object 3").materials == dressed[3].materials
+    for one in dressed:
+        material = one.materials[0]
+        colors = sample_surface(one, 200, np.random.default_rng(0)).colors
+        assert 0.02 < colors.mean() < 0.98
+        assert 0.05 < material.roughness < 1
+        assert np.isfinite(one.corner_uv).all()
+
+
+@needs_sample
+def test_published_sample_loads(tmp_path, quick_preparation, monkeypatch):
+    """Every real mesh, with solids (and figures of their fit) coarse enough for seconds."""
+    monkeypatch.setattr("datagen.objects.preparation.N_DEVIATION_POINTS", 1000)
+    coarse = replace(
+        quick_preparation.solid, level_set=replace(quick_preparation.solid.level_set, voxels_longest=40)
+    )
+    library = GraspXLObjects(
+        SAMPLE,
+        None,
+        textures="none",
+        reading=REFERENCE_READING,
+        preparation=replace(quick_preparation, solid=coarse),
+        registration=REFERENCE_REGISTRATION,
+        cache_dir=tmp_path,
+    )
+    assert len(library.uids()) >= 20
+    for uid in library.uids()[:20]:
+        asset = library.load(uid)
+        sides = np.ptp(asset.mesh.verts_obj, axis=0)
+        assert 0.06 < sides.min() < 0.09
+        np.testing.assert_allclose(asset.T_obj_from_file[:3, :3], np.eye(3))
+        assert np.abs(asset.T_obj_from_file[:3, 3]).max() < 1e-4  # published meshes are centred
+        assert trimesh.Trimesh(asset.solid.verts_obj, asset.solid.faces, process=False).is_watertight
