@@ -1,8 +1,10 @@
 """A shard in the terminal: clips, objects, licences, quality, sizes, timings."""
 
+import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from rich.console import Group
@@ -12,13 +14,14 @@ from shards.reader import Shard
 from shards.reader import Table as Columns
 from shards.records import ShardRecord
 
-__all__ = ["shard_line", "shard_summary"]
+__all__ = ["shard_line", "shard_summary", "short_uid"]
 
 CLIP_COLUMNS = (
     "clip_id", "motion_index", "camera_kind", "object_uid", "split", "n_frames", "fps", "image_width",
     "image_height", "object_visible_fraction_mean", "object_visible_fraction_min", "object_drift_px",
     "min_margin_px", "max_penetration_m", "digits_in_contact", "slip_lift_m", "slip_manipulation_m",
-    "grasp_attempts", "hdri", "table_material", "render_device", "render_samples", "render_seconds",
+    "grasp_attempts", "hand_model", "hand_side", "hand_stands_in_for", "grasp_source", "hdri",
+    "table_material", "render_device", "render_samples", "render_seconds",
 )  # fmt: skip
 OBJECT_COLUMNS = (
     "object_uid",
@@ -35,6 +38,7 @@ TEXT_COLUMNS = (
     "clip",
     "camera",
     "object",
+    "hand",
     "licence",
     "author",
     "light",
@@ -43,6 +47,9 @@ TEXT_COLUMNS = (
     "phase",
     "reason",
 )
+
+
+_AUTHOR_CHARACTERS = 24  # names may be long; the shard holds them whole
 
 
 def shard_line(record: ShardRecord, out: Path) -> str:
@@ -68,7 +75,8 @@ def shard_summary(shard: Shard) -> Group:
 def _table(title: str, *columns: str) -> Table:
     table = Table(title=title, title_justify="left")
     for column in columns:
-        table.add_column(column, justify="left" if column in TEXT_COLUMNS else "right")
+        justify: Literal["left", "right"] = "left" if column in TEXT_COLUMNS else "right"
+        table.add_column(column, justify=justify, overflow="fold" if column == "object" else "ellipsis")
     return table
 
 
@@ -85,6 +93,8 @@ def _overview(shard: Shard, clips: Columns) -> Table:
         ("clips", f"{len(clips)}"),
         ("frames", f"{sum(clips['n_frames'])}"),
         ("images", ", ".join(sizes)),
+        ("motions from", ", ".join(sorted(set(clips["grasp_source"])))),
+        ("hands", ", ".join(f"{hand} {count}" for hand, count in sorted(_hands(clips).items()))),
         ("splits", ", ".join(f"{split} {count}" for split, count in sorted(splits.items()))),
         ("rendered on", ", ".join(sorted(set(clips["render_device"])))),
     ):
@@ -97,9 +107,9 @@ def _objects(objects: Columns, clips: Columns) -> Table:
     count = Counter(clips["object_uid"])
     for i, uid in enumerate(objects["object_uid"]):
         table.add_row(
-            uid,
+            short_uid(uid),
             objects["licence"][i],
-            objects["author"][i],
+            objects["author"][i][:_AUTHOR_CHARACTERS],
             f"{100 * objects['object_scale_m'][i]:.1f} cm",
             f"{objects['texture_resolution_px'][i]} px",
             f"{objects['color_detail'][i]:.2f}",
@@ -111,20 +121,37 @@ def _objects(objects: Columns, clips: Columns) -> Table:
 def _motions(clips: Columns) -> Table:
     """Grasp and setting of each motion; its clips share them."""
     table = _table(
-        "motions", "motion", "object", "grasp depth", "digits", "slip lift/turn", "tries", "light", "table"
+        "motions", "motion", "object", "hand", "depth", "digits", "slip lift/turn", "tries", "light", "table"
     )
     for i in _first_clips(clips):
         table.add_row(
             str(clips["motion_index"][i]),
-            clips["object_uid"][i],
-            f"{1000 * clips['max_penetration_m'][i]:.1f} mm",
+            short_uid(clips["object_uid"][i]),
+            clips["hand_side"][i],
+            _millimetres(clips["max_penetration_m"][i], 1),
             str(clips["digits_in_contact"][i]),
-            f"{1000 * clips['slip_lift_m'][i]:.0f}/{1000 * clips['slip_manipulation_m'][i]:.0f} mm",
-            str(clips["grasp_attempts"][i]),
+            f"{_millimetres(clips['slip_lift_m'][i])}/{_millimetres(clips['slip_manipulation_m'][i])}",
+            str(clips["grasp_attempts"][i] or "-"),
             clips["hdri"][i],
             clips["table_material"][i] or "none",
         )
     return table
+
+
+def short_uid(uid: str) -> str:
+    """An uid with Objaverse's 32 digits cut to 8; others as they are."""
+    return re.sub(r"[0-9a-f]{32}", lambda digits: f"{digits[0][:8]}…", uid)
+
+
+def _hands(clips: Columns) -> Counter[str]:
+    """Clips per hand model, saying where it only stands in for the recorded one."""
+    pairs = zip(clips["hand_model"], clips["hand_stands_in_for"])
+    return Counter(f"{model} (stands in for {other})" if other else model for model, other in pairs)
+
+
+def _millimetres(metres: float, decimals: int = 0) -> str:
+    """A length, or a dash where there is none."""
+    return "-" if np.isnan(metres) else f"{1000 * metres:.{decimals}f} mm"
 
 
 def _clips(clips: Columns) -> Table:
