@@ -1,0 +1,198 @@
+"""The probability path, its loss, guidance and the Euler sampler, against closed forms."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from model.errors import ModelError
+from model.flow import (
+    Guidance,
+    LogitNormalTime,
+    SamplerSettings,
+    UniformTime,
+    clean_from_velocity,
+    euler_path,
+    euler_sample,
+    guided,
+    interpolate,
+    joint_cfm_loss,
+    noise_from_velocity,
+    noise_like,
+    sample_times,
+    time_grid,
+    velocity_from_clean,
+    velocity_from_noise,
+    velocity_target,
+)
+
+
+def _random(seed: int, *shape: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_path_ends_at_clean_and_noise() -> None:
+    clean, noise = _random(0, 2, 3, 4), _random(1, 2, 3, 4)
+    torch.testing.assert_close(interpolate(clean, noise, torch.zeros(2)), clean)
+    torch.testing.assert_close(interpolate(clean, noise, torch.ones(2)), noise)
+
+
+def test_velocity_target_is_the_derivative_of_the_path() -> None:
+    clean, noise = _random(0, 2, 5), _random(1, 2, 5)
+    t = torch.tensor([0.2, 0.7], dtype=torch.float64)
+    step = 1e-3
+    slope = (interpolate(clean, noise, t + step) - interpolate(clean, noise, t - step)) / (2 * step)
+    torch.testing.assert_close(slope, velocity_target(clean, noise))
+
+
+@given(st.floats(0.01, 0.99), st.integers(0, 1000))
+@settings(max_examples=30, deadline=None)
+def test_conversions_round_trip(time: float, seed: int) -> None:
+    clean, noise = _random(seed, 2, 3, 4), _random(seed + 1, 2, 3, 4)
+    t = torch.tensor([time, 1 - time], dtype=torch.float64)
+    x_t, velocity = interpolate(clean, noise, t), velocity_target(clean, noise)
+    torch.testing.assert_close(clean_from_velocity(x_t, velocity, t), clean)
+    torch.testing.assert_close(noise_from_velocity(x_t, velocity, t), noise)
+    torch.testing.assert_close(velocity_from_clean(x_t, clean, t), velocity)
+    torch.testing.assert_close(velocity_from_noise(x_t, noise, t), velocity)
+
+
+def test_uniform_and_logit_normal_times_have_their_distributions() -> None:
+    generator = torch.Generator().manual_seed(0)
+    uniform = sample_times(UniformTime(), 20_000, generator)
+    assert abs(float(uniform.mean()) - 0.5) < 0.01
+    assert abs(float(uniform.var()) - 1 / 12) < 0.002
+    times = sample_times(LogitNormalTime(mean=1.0, std=1.0), 20_000, generator)
+    normal = torch.logit(times.double())
+    assert abs(float(normal.mean()) - 1.0) < 0.03
+    assert abs(float(normal.std()) - 1.0) < 0.03
+
+
+def test_times_repeat_with_the_generator() -> None:
+    first, second = (sample_times(UniformTime(), 4, torch.Generator().manual_seed(7)) for _ in range(2))
+    assert torch.equal(first, second)
+
+
+def test_joint_loss_is_eq_2_and_names_samples() -> None:
+    masks, geometry = _random(0, 3, 2, 1, 4, 4), _random(1, 3, 8, 2, 2, 2)
+    mask_error = torch.tensor([1.0, 0.0, 2.0]).double()
+    loss = joint_cfm_loss(
+        predicted_masks=masks + mask_error[:, None, None, None, None],
+        target_masks=masks,
+        predicted_geometry=geometry + 3,
+        target_geometry=geometry,
+        beta=0.5,
+    )
+    torch.testing.assert_close(loss.masks, torch.tensor([1.0, 0.0, 4.0]))
+    torch.testing.assert_close(loss.geometry, torch.full((3,), 9.0))
+    assert float(loss.total) == pytest.approx(5 / 3 + 0.5 * 9)
+
+
+def test_loss_of_a_batch_is_the_mean_over_its_shares() -> None:
+    a, b = _random(0, 4, 6), _random(1, 4, 6)
+
+    def loss(rows: slice) -> float:
+        joint = joint_cfm_loss(
+            predicted_masks=a[rows], target_masks=b[rows], predicted_geometry=b[rows], target_geometry=a[rows], beta=2.0
+        )
+        return float(joint.total)
+
+    assert loss(slice(0, 4)) == pytest.approx((loss(slice(0, 2)) + loss(slice(2, 4))) / 2)
+
+
+@pytest.mark.parametrize("rescale_t", [1.0, 3.0])
+def test_sampler_is_exact_on_straight_paths(rescale_t: float) -> None:
+    clean = {"geometry": _random(0, 2, 8, 4, 4, 4), "masks": _random(1, 2, 3, 1, 8, 8)}
+    noise = noise_like(clean, torch.Generator().manual_seed(2))
+    target = {name: velocity_target(clean[name], noise[name]) for name in clean}
+    sampled = euler_sample(lambda x_t, t: target, noise, SamplerSettings(steps=3, rescale_t=rescale_t))
+    for name, value in clean.items():
+        torch.testing.assert_close(sampled[name], value)
+
+
+@pytest.mark.parametrize("rescale_t", [1.0, 3.0])
+def test_error_slope_of_euler_is_minus_one_on_a_linear_field(rescale_t: float) -> None:
+    start = _random(0, 2, 3)
+    steps = [32, 64, 128, 256, 512]
+    errors = []
+    for count in steps:
+        end = euler_sample(lambda x, t: {"x": x["x"]}, {"x": start}, SamplerSettings(steps=count, rescale_t=rescale_t))
+        # dx/dt = x from t = 1 to 0: x(0) = x(1) / e.
+        errors.append(float((end["x"] - start / math.e).abs().max()))
+    slope = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert slope == pytest.approx(-1, abs=0.02)
+
+
+def test_time_grid_is_trellis_rescaling() -> None:
+    times = time_grid(SamplerSettings(steps=4, rescale_t=3.0))
+    expected = [3 * t / (1 + 2 * t) for t in (1, 0.75, 0.5, 0.25, 0)]
+    np.testing.assert_allclose(times.numpy(), expected)
+
+
+def test_every_tensor_gets_the_same_time() -> None:
+    seen = []
+
+    def velocity(x_t: dict[str, torch.Tensor], t: torch.Tensor) -> dict[str, torch.Tensor]:
+        seen.append((set(x_t), t.tolist()))
+        return x_t
+
+    noise = {"a": torch.ones(2, 1), "b": torch.ones(2, 3)}
+    states = list(euler_path(velocity, noise, SamplerSettings(steps=2, rescale_t=1.0)))
+    assert seen == [({"a", "b"}, [1.0, 1.0]), ({"a", "b"}, [0.5, 0.5])]
+    assert [float(state["a"][0]) for state in states] == [0.5, 0.25]
+    assert torch.equal(noise["a"], torch.ones(2, 1))  # the caller's tensors are left alone
+
+
+def test_guidance_is_per_tensor_and_only_inside_its_interval() -> None:
+    calls = []
+
+    def unconditional(x_t: dict[str, torch.Tensor], t: torch.Tensor) -> dict[str, torch.Tensor]:
+        calls.append(float(t[0]))
+        return {name: torch.zeros_like(value) for name, value in x_t.items()}
+
+    state = {"geometry": torch.ones(1, 2), "masks": torch.ones(1, 3)}
+    guidance = Guidance(strength={"geometry": 5.0}, interval=(0.5, 1.0))
+    velocity = guided(lambda x_t, t: x_t, unconditional, guidance)
+    inside = velocity(state, torch.tensor([0.5]))
+    assert inside["geometry"].tolist() == [[6.0, 6.0]]
+    assert inside["masks"].tolist() == [[1.0, 1.0, 1.0]]
+    outside = velocity(state, torch.tensor([0.49]))
+    assert outside["geometry"].tolist() == [[1.0, 1.0]]
+    assert calls == [0.5]
+
+
+def test_zero_strength_is_conditional() -> None:
+    def unconditional(x_t: dict[str, torch.Tensor], t: torch.Tensor) -> dict[str, torch.Tensor]:
+        raise AssertionError("not needed")
+
+    state = {"geometry": _random(0, 1, 2)}
+    velocity = guided(lambda x_t, t: x_t, unconditional, Guidance(strength={"geometry": 0.0}, interval=(0.0, 1.0)))
+    assert velocity(state, torch.ones(1))["geometry"] is state["geometry"]
+
+
+def test_noise_repeats_with_the_generator_whatever_the_order_of_names() -> None:
+    shapes = {"geometry": torch.zeros(1, 8), "masks": torch.zeros(1, 2)}
+    first = noise_like(shapes, torch.Generator().manual_seed(3))
+    second = noise_like(dict(reversed(shapes.items())), torch.Generator().manual_seed(3))
+    assert all(torch.equal(first[name], second[name]) for name in shapes)
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: SamplerSettings(steps=0, rescale_t=1.0),
+        lambda: SamplerSettings(steps=5, rescale_t=0.0),
+        lambda: Guidance(strength={}, interval=(0.8, 0.2)),
+        lambda: LogitNormalTime(mean=0.0, std=0.0),
+        lambda: guided(lambda x, t: x, lambda x, t: x, Guidance(strength={"mask": 1.0}, interval=(0.0, 1.0)))(
+            {"masks": torch.ones(1)}, torch.ones(1)
+        ),
+    ],
+)
+def test_bad_settings_are_one_clear_line(make) -> None:
+    with pytest.raises(ModelError, match="expected") as caught:
+        make()
+    assert "\n" not in str(caught.value)
