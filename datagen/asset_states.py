@@ -13,7 +13,7 @@ from datagen.config import DatasetConfig
 from datagen.grasps.graspxl import LICENCE as GRASPXL_LICENCE
 from datagen.grasps.graspxl import SIZES, find_sequences
 from datagen.hand_source import html_dir, mano_dir
-from datagen.hands.html_skin import load_html_skin
+from datagen.hands.html_skin import find_html, load_html_skin
 from datagen.hands.mano import find_mano, load_mano
 from datagen.input_error import InputError
 from datagen.motion_source import graspxl_root
@@ -158,9 +158,10 @@ def _html(config: DatasetConfig) -> AssetState:
         setting="hand.html_dir, HTML_DIR",
         how_to_get="request it at handtracker.mpi-inf.mpg.de/projects/HandTextureModel, unpack TextureBasis",
     )
-    if folder is None or not (folder / "TextureBasis").is_dir():
+    basis_folder = None if folder is None else find_html(folder)
+    if folder is None or basis_folder is None:
         return missing
-    state = _found(missing, "", folder / "TextureBasis")
+    state = _found(missing, "", basis_folder)
     if hands is None or find_mano(hands, "right") is None:
         return _wrong(state, "found, but it needs MANO_RIGHT.pkl, on whose triangles it lies")
 

@@ -20,12 +20,14 @@ from datagen.cli_options import (
 )
 from datagen.config import load_config
 from datagen.inspection.plan_table import plan_table
-from datagen.inspection.selection_table import selection_line
+from datagen.inspection.selection_table import selection_lines
 from datagen.inspection.sheet import contact_sheet, write_png
 from datagen.inspection.summary import shard_line, shard_summary
 from datagen.inspection.video import write_video
-from datagen.pipeline import RenderOptions, plan_dataset, render_shard
+from datagen.pipeline import RenderOptions, render_shard
+from datagen.planning import plan_dataset
 from datagen.render_progress import RenderProgress
+from datagen.select_motions import Selection
 from datagen.selection_progress import SelectionProgress
 from shards.errors import ShardError
 from shards.reader import Shard, open_dataset, open_shard
@@ -67,7 +69,7 @@ def plan(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | N
     out = out or default_out(config_path)
     with SelectionProgress() as bar:
         made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
-    click.echo(selection_line(selection.decisions))
+    _say_selection(selection)
     Console().print(plan_table(made, out))
 
 
@@ -107,7 +109,7 @@ def render(
     out = out or default_out(config_path)
     with SelectionProgress() as bar:
         made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
-    click.echo(selection_line(selection.decisions))
+    _say_selection(selection)
     options = RenderOptions(
         device=device, workers=workers, threads_per_worker=threads, licence_allow=licence_allow
     )
@@ -195,6 +197,13 @@ def verify(path: Path) -> None:
             click.echo(f"  {finding}")
         bad += not report.ok
     sys.exit(1 if bad else 0)
+
+
+def _say_selection(selection: Selection | None) -> None:
+    """One line on a selection that was made just now; nothing on a plan that was there."""
+    if selection is not None:
+        for line in selection_lines(selection):
+            click.echo(line)
 
 
 def _open(shard: str, out: Path) -> Shard:

@@ -1,6 +1,8 @@
 """Commands about what goes in: `datagen assets`, `datagen select`, `datagen grasps`."""
 
+import difflib
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import click
@@ -23,15 +25,19 @@ from datagen.grasps.replay_report import ReplayOutcome
 from datagen.grasps.report import GraspReport, summarise
 from datagen.grasps.synthesise import GraspAttemptReport, synthesise_grasp
 from datagen.hand_source import open_hand
-from datagen.hands.model import shape_hand
+from datagen.hands.model import ShapedHand, shape_hand
+from datagen.input_error import InputError
 from datagen.inspection.asset_table import asset_table
 from datagen.inspection.grasp_table import grasp_table
 from datagen.inspection.replay_table import replay_table
-from datagen.inspection.selection_table import selection_table
+from datagen.inspection.selection_table import selection_lines, selection_table
 from datagen.library import open_library
 from datagen.motion_source import recorded_sequences
+from datagen.objects.asset import ObjectAsset
+from datagen.objects.errors import ObjectError
 from datagen.sampling.streams import Stream, stream_rng
 from datagen.select_motions import SELECTION_FILE, select_motions
+from datagen.selection import names_of, normalised_name
 from datagen.selection_progress import SelectionProgress
 
 __all__ = ["assets", "grasps", "select"]
@@ -69,6 +75,8 @@ def select(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] |
         selection = select_motions(config, out, workers=workers, report=bar.update)
     console = Console()
     console.print(selection_table(selection.decisions))
+    for line in selection_lines(selection):
+        console.print(line)
     console.print(f"every decision with its reason and figures: {out / SELECTION_FILE}")
 
 
@@ -119,32 +127,52 @@ def _simulated(
 def _replayed(
     config: DatasetConfig, objects: tuple[str, ...], motions: int | None, bar: SelectionProgress
 ) -> list[ReplayOutcome]:
-    files = list(recorded_sequences(config.motions).values())
-    if objects:
-        files = [file for file in files if file.object_uid in objects]
     of_object: dict[str, list[SequenceFile]] = {}
-    for file in files:
+    for file in recorded_sequences(config.motions).values():
         of_object.setdefault(file.object_uid, []).append(file)
-    chosen = [file for group in of_object.values() for file in group[:motions]]
+    wanted = {name: uids_named(name, of_object) for name in objects}
+    chosen = [uid for uids in wanted.values() for uid in uids] or list(of_object)
     library = open_library(config.objects, config.motions)
     model = open_hand(config.hand).right
     hand = shape_hand(model, np.zeros(model.shapedirs.shape[2]))
     outcomes: list[ReplayOutcome] = []
-    for file in chosen:
-        bar.update(len(outcomes), len(chosen), file.sequence_id)
-        asset = library.load(file.object_uid)
-        recorded = read_sequence(file)
-        began = time.process_time()
+    for done, uid in enumerate(chosen):
+        bar.update(done, len(chosen), uid)
+        files = of_object[uid][:motions]
         try:
-            made, reason = replay(recorded, hand, asset, config.motions.replay), ""
-        except ReplayError as error:
-            made, reason = None, str(error)
-        outcomes.append(
-            ReplayOutcome(
-                sequence_id=file.sequence_id,
-                sequence=made,
-                reason=reason,
-                cpu_seconds=time.process_time() - began,
-            )
-        )
+            asset = library.load(uid)
+        except ObjectError as error:
+            outcomes += [ReplayOutcome.refused(file.sequence_id, str(error)) for file in files]
+            continue
+        outcomes += [_replay_one(file, hand, asset, config) for file in files]
     return outcomes
+
+
+def uids_named(name: str, of_object: Mapping[str, object]) -> list[str]:
+    """Objects that a name given on the command line means: the uid, or all sizes of an object."""
+    found = [uid for uid in of_object if normalised_name(name) in names_of(uid)]
+    if not found:
+        close = difflib.get_close_matches(name, of_object, n=1)
+        raise InputError(
+            "--object",
+            f"{name!r} has no recorded motion",
+            expected="an object of the GraspXL folder",
+            action=f"Did you mean {close[0]!r}?" if close else "`datagen select` lists them.",
+        )
+    return found
+
+
+def _replay_one(
+    file: SequenceFile, hand: ShapedHand, asset: ObjectAsset, config: DatasetConfig
+) -> ReplayOutcome:
+    began = time.process_time()
+    try:
+        sequence = replay(read_sequence(file), hand, asset, config.motions.replay)
+    except (ReplayError, InputError) as error:
+        return ReplayOutcome.refused(file.sequence_id, str(error))
+    return ReplayOutcome(
+        sequence_id=file.sequence_id,
+        sequence=sequence,
+        reason="",
+        cpu_seconds=time.process_time() - began,
+    )

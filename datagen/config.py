@@ -25,7 +25,7 @@ from shards.records import Provenance
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
 
-__all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config", "provenance_of"]
+__all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config", "placeless", "provenance_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +73,7 @@ def load_config(path: Path, *, licence_allow: tuple[str, ...] | None = None) -> 
     config = settings_from_dict(DatasetConfig, data, where=str(path))
     selection = config.selection
     if selection.takedown is not None:
-        selection = replace(selection, takedown=path.parent / selection.takedown)
+        selection = replace(selection, takedown=(path.parent / selection.takedown.expanduser()).resolve())
     if licence_allow is not None:
         selection = replace(selection, licence_allow=licence_allow)
     return replace(config, hand=resolved_hand(config.hand), selection=selection)
@@ -87,14 +87,18 @@ def config_as_yaml(config: DatasetConfig) -> str:
 
 def config_sha256(config: DatasetConfig) -> str:
     """Changes when any setting that decides the data changes; where assets and caches lie does not."""
-    placeless = replace(
+    return hashlib.sha256(config_as_yaml(placeless(config)).encode()).hexdigest()
+
+
+def placeless(config: DatasetConfig) -> DatasetConfig:
+    """The configuration without the places of files on this machine."""
+    return replace(
         config,
         objects=replace(config.objects, path=None, cache_dir=None, objaverse_root=None),
         motions=replace(config.motions, graspxl_root=None),
         selection=replace(config.selection, takedown=None),
         hand=replace(config.hand, mano_dir=None, html_dir=None),
     )
-    return hashlib.sha256(config_as_yaml(placeless).encode()).hexdigest()
 
 
 def provenance_of(config: DatasetConfig) -> Provenance:

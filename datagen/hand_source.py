@@ -5,15 +5,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from datagen.hands.html_skin import load_html_skin
+from datagen.hands.html_skin import find_html, load_html_skin
 from datagen.hands.mano import find_mano, load_mano
 from datagen.hands.model import HandModel, load_open_hand, mirror_hand
 from datagen.hands.skin import SkinBasis, load_open_skin
 from datagen.input_error import InputError
 
 __all__ = ["HandConfig", "HandSource", "html_dir", "mano_dir", "open_hand", "resolved_hand"]
-
-HTML_MODEL = Path("TextureBasis") / "model_sr" / "model.pkl"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,24 +48,37 @@ class HandSource:
 
 def mano_dir(config: HandConfig) -> Path | None:
     """Where MANO should lie: the configuration, else $MANO_DIR, else nowhere."""
-    return config.mano_dir or _from_environment("MANO_DIR")
+    return _place(config.mano_dir, "MANO_DIR")
 
 
 def html_dir(config: HandConfig) -> Path | None:
     """Where the HTML texture model should lie: the configuration, else $HTML_DIR, else nowhere."""
-    return config.html_dir or _from_environment("HTML_DIR")
+    return _place(config.html_dir, "HTML_DIR")
 
 
 def resolved_hand(config: HandConfig) -> HandConfig:
-    """`auto` decided by what is on this machine, so that what was used is part of the configuration."""
+    """`auto` decided by what is on this machine, so that what was used is part of the configuration.
+
+    A place that is named but does not hold the files is an InputError, not a reason to take the
+    open hand.
+    """
     model, skin = config.model, config.skin
+    hands, textures = mano_dir(config), html_dir(config)
     if model == "auto":
-        folder = mano_dir(config)
-        model = "mano" if folder is not None and find_mano(folder, "right") is not None else "open"
+        model = "open" if hands is None else "mano"
+        if hands is not None and find_mano(hands, "right") is None:
+            raise _lacks(hands, "hand.mano_dir (or MANO_DIR)", "MANO_RIGHT.pkl")
+    if skin == "html" and model == "open":
+        raise InputError(
+            "hand.skin",
+            "is html, but there is no MANO, on whose triangles that texture lies",
+            expected="hand.mano_dir or MANO_DIR to name the folder of MANO_RIGHT.pkl",
+            action="Set it, or choose hand.skin: open; `datagen assets` tells where to get the files.",
+        )
     if skin == "auto":
-        folder = html_dir(config)
-        there = folder is not None and (folder / HTML_MODEL).is_file()
-        skin = "html" if model == "mano" and there else "open"
+        skin = "html" if model == "mano" and textures is not None else "open"
+        if skin == "html" and textures is not None and find_html(textures) is None:
+            raise _lacks(textures, "hand.html_dir (or HTML_DIR)", "TextureBasis/model_sr/model.pkl")
     return replace(config, model=model, skin=skin)
 
 
@@ -97,6 +108,16 @@ def _required(folder: Path | None, key: str, variable: str, content: str) -> Pat
     return folder
 
 
-def _from_environment(variable: str) -> Path | None:
-    value = os.environ.get(variable, "")
-    return Path(value).expanduser() if value else None
+def _lacks(folder: Path, setting: str, content: str) -> InputError:
+    return InputError(
+        folder,
+        f"holds no {content}, though {setting} names it",
+        expected=f"a folder with {content}",
+        action="Correct the place, or take the setting away to use the open hand.",
+    )
+
+
+def _place(path: Path | None, variable: str) -> Path | None:
+    """`path`, else what the environment variable says, with ~ expanded."""
+    named = str(path) if path is not None else os.environ.get(variable, "")
+    return Path(named).expanduser() if named else None

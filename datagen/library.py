@@ -1,5 +1,6 @@
 """From the `objects` section of a configuration to an object library."""
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,7 +13,7 @@ from datagen.objects.preparation import PreparationConfig
 from datagen.objects.reading import ReadingConfig
 from datagen.objects.registration import RegistrationConfig
 
-__all__ = ["ObjectsConfig", "open_library"]
+__all__ = ["ObjectsConfig", "library_state", "open_library"]
 
 DEFAULT_CACHE = Path("~/.cache/forehoi/objects")
 
@@ -47,10 +48,10 @@ def open_library(config: ObjectsConfig, motions: MotionsConfig) -> ObjectLibrary
 
 
 def _graspxl(config: ObjectsConfig, motions: MotionsConfig, cache_dir: Path) -> GraspXLObjects:
+    # Also without textures: its metadata tell the licence of what a bare mesh derives from.
+    there = (objaverse_root(config.objaverse_root) / "glbs").is_dir()
     store = None
-    if config.textures != "none" and (
-        config.textures == "required" or (objaverse_root(config.objaverse_root) / "glbs").is_dir()
-    ):
+    if there or config.textures == "required":
         store = ObjaverseStore(config.objaverse_root, config.reading, config.preparation, cache_dir)
     return GraspXLObjects(
         graspxl_root(motions.graspxl_root),
@@ -61,3 +62,20 @@ def _graspxl(config: ObjectsConfig, motions: MotionsConfig, cache_dir: Path) -> 
         registration=config.registration,
         cache_dir=cache_dir,
     )
+
+
+def library_state(config: ObjectsConfig) -> str:
+    """Changes when files that decisions on objects rest on come, go or change on this machine."""
+    if config.source == "folder":
+        found = sorted((config.path or Path()).rglob("*"))
+    elif config.source in ("objaverse", "graspxl"):
+        root = objaverse_root(config.objaverse_root)
+        found = sorted((root / "metadata").glob("*"))
+        found += sorted((root / "glbs").glob("*/*.glb")) if config.textures != "none" else []
+    else:
+        return ""  # packages: their content does not change by itself
+    digest = hashlib.sha256()
+    for path in found:
+        known = path.stat()
+        digest.update(f"{path.name} {known.st_size} {known.st_mtime_ns}\n".encode())
+    return digest.hexdigest()

@@ -9,6 +9,7 @@ from datagen.grasps.replay import replay
 from datagen.grasps.sequence import GraspSequence
 from datagen.grasps.synthesise import synthesise_grasp
 from datagen.hands.model import HandModel, shape_hand
+from datagen.input_error import InputError
 from datagen.library import open_library
 from datagen.motion_source import graspxl_root
 from datagen.objects.asset import ObjectAsset
@@ -34,7 +35,8 @@ def load_object(config: DatasetConfig, motion: MotionPlan) -> ObjectAsset:
 
     ObjectError where this machine lacks the file or reads it otherwise than the selection did.
     UnusableObjectError (only with `selection.unusable: remove`) where it reads well, but no solid
-    can be made of it, which the selection does not try.
+    can be made of it, which the selection does not try. InputError where licence or appearance
+    are not those that were planned.
     """
     library, uid = open_library(config.objects, config.motions), unmirrored_uid(motion.object_uid)
     try:
@@ -44,6 +46,13 @@ def load_object(config: DatasetConfig, motion: MotionPlan) -> ObjectAsset:
             raise
         library.texture_quality(uid)
         raise UnusableObjectError(str(error)) from error
+    if (asset.licence, asset.appearance) != (motion.licence, motion.appearance):
+        raise InputError(
+            motion.object_uid,
+            f"is drawn here as {asset.appearance} under {asset.licence}",
+            expected=f"{motion.appearance} under {motion.licence}, as it was planned and allowed",
+            action="Give this machine the same object store and metadata, or plan anew into another --out.",
+        )
     return mirrored_asset(asset) if is_mirrored(motion.object_uid) else asset
 
 

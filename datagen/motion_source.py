@@ -26,7 +26,7 @@ class MotionsConfig:
 def graspxl_root(path: Path | None) -> Path:
     """The GraspXL folder: `path`, else $GRASPXL. InputError when neither is given."""
     if path is not None:
-        return path
+        return path.expanduser()
     value = os.environ.get("GRASPXL", "")
     if not value:
         raise InputError(

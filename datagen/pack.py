@@ -70,7 +70,7 @@ def object_row(asset: ObjectAsset, targets: LearningTargets) -> ObjectRow:
         licence=asset.licence,
         author=asset.author,
         url=asset.url,
-        mesh_glb=glb if asset.licence in REDISTRIBUTABLE else None,
+        mesh_glb=glb if set(asset.licence.split(" AND ")) <= set(REDISTRIBUTABLE) else None,
         mesh_sha256=hashlib.sha256(glb).hexdigest(),
         object_scale_m=targets.object_scale_m,
         catalogue_scale=asset.catalogue_scale,
@@ -83,6 +83,7 @@ def object_row(asset: ObjectAsset, targets: LearningTargets) -> ObjectRow:
         sdf_values=targets.sdf_values,
         texture_resolution_px=asset.texture.texture_resolution_px,
         color_detail=asset.texture.color_detail,
+        appearance=asset.appearance,
         registration_residual=float("nan") if asset.registration is None else asset.registration.residual,
         watertight_source=asset.solid.watertight_source,
     )

@@ -7,9 +7,10 @@ again.
 
 import fcntl
 import os
+import shutil
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,14 +18,20 @@ from pathlib import Path
 from typing import Any
 
 from datagen.child import BAD_INPUT, ChildError, run_child
-from datagen.config import DatasetConfig, config_as_yaml, provenance_of
-from datagen.plan import PLAN_FILE, Plan, make_plan, read_plan, same_plan, write_plan
-from datagen.select_motions import Selection, select_motions
-from shards.records import DatasetRecord, ShardRecord
-from shards.schema import CONVENTIONS, SCHEMA_VERSION
-from shards.writer import begin_dataset, commit_shard, is_motion_staged, is_shard_committed
+from datagen.config import DatasetConfig, provenance_of
+from datagen.plan import MotionPlan, Plan
+from datagen.selection import read_takedown, taken_down
+from shards.records import Provenance, ShardRecord
+from shards.writer import (
+    commit_shard,
+    is_motion_staged,
+    is_shard_committed,
+    motion_dir,
+    shard_dir,
+    stage_skipped_motion,
+)
 
-__all__ = ["PipelineError", "Progress", "RenderOptions", "plan_dataset", "render_shard"]
+__all__ = ["PipelineError", "Progress", "RenderOptions", "render_shard"]
 
 
 class PipelineError(RuntimeError):
@@ -51,50 +58,6 @@ class Progress:
     total: int
 
 
-def plan_dataset(
-    config: DatasetConfig,
-    out: Path,
-    *,
-    workers: int = 1,
-    report: Callable[[int, int], None] | None = None,
-) -> tuple[Plan, Selection]:
-    """Write dataset.json, selection.parquet and plan.parquet, or check that those which are there say the same.
-
-    `workers` and `report` are those of `select_motions`. ShardError when `out` holds a dataset of
-    another configuration.
-    """
-    record = DatasetRecord(
-        schema_version=SCHEMA_VERSION,
-        name=config.name,
-        conventions=CONVENTIONS,
-        provenance=provenance_of(config),
-        config_yaml=config_as_yaml(config),
-        split_rule=config.split,
-    )
-    begin_dataset(out, record)
-    selection = select_motions(config, out, workers=workers, report=report)
-    plan = make_plan(
-        config.plan,
-        dataset_seed=config.seed,
-        candidates=[decision.candidate for decision in selection.kept],
-        left_probability=config.hand.left_probability,
-        split_rule=config.split,
-        n_cameras=config.sampling.cameras.n_cameras,
-        n_frames=config.sampling.clip.n_frames,
-        image_size=config.sampling.cameras.image_size,
-        samples=config.sampling.render.samples,
-    )
-    path = out / PLAN_FILE
-    if not path.exists():
-        write_plan(plan, path)
-    elif not same_plan(read_plan(path), plan):
-        raise PipelineError(
-            f"{path}: differs from the plan of this configuration (have objects, recordings or the takedown "
-            "list changed?); choose another --out, or delete this one to start over"
-        )
-    return plan, selection
-
-
 def render_shard(
     config_path: Path,
     config: DatasetConfig,
@@ -104,11 +67,16 @@ def render_shard(
     options: RenderOptions,
     report: Callable[[Progress], None],
 ) -> ShardRecord:
-    """Render what is missing of one shard and commit it. Safe to repeat, kill and repeat."""
+    """Render what is missing of one shard and commit it. Safe to repeat, kill and repeat.
+
+    What has come onto the takedown list since the plan was made is skipped with that reason, also
+    where it waits rendered; of a shard that is finished it raises PipelineError.
+    """
     motions = plan.shard(shard)
     indices = [motion.motion_index for motion in motions]
     provenance = provenance_of(config)
     with _lock(out / "staging" / f"shard-{shard:05d}.lock"):
+        _take_down(motions, out, shard, read_takedown(config.selection.takedown), provenance)
         if not is_shard_committed(out, shard):
             staged = [index for index in indices if is_motion_staged(out, shard, index, provenance)]
             for index in staged:
@@ -116,6 +84,29 @@ def render_shard(
             waiting = [index for index in indices if index not in staged]
             _run_workers(config_path, out, waiting, shard, options, report)
         return commit_shard(out, shard, motion_indices=indices, provenance=provenance)
+
+
+def _take_down(
+    motions: Sequence[MotionPlan], out: Path, shard: int, takedown: frozenset[str], provenance: Provenance
+) -> None:
+    listed = {motion: taken_down(motion.object_uid, motion.sequence_id, takedown) for motion in motions}
+    named = {motion: entry for motion, entry in listed.items() if entry is not None}
+    if named and is_shard_committed(out, shard):
+        entries = ", ".join(sorted(set(named.values())))
+        raise PipelineError(
+            f"{shard_dir(out, shard)}: is finished and holds {len(named)} motions of what the takedown list "
+            f"names ({entries}); delete this shard, withdraw its copies, and render it again"
+        )
+    for motion, entry in named.items():
+        shutil.rmtree(motion_dir(out, shard, motion.motion_index), ignore_errors=True)
+        stage_skipped_motion(
+            out,
+            shard,
+            motion.motion_index,
+            reason=f"on the takedown list as {entry}",
+            timings_s={},
+            provenance=provenance,
+        )
 
 
 def _run_workers(

@@ -53,6 +53,8 @@ class Candidate:
 
     object_uid: str
     sequence_id: str  # empty: the motion is simulated
+    licence: str  # as the selection found and allowed it
+    appearance: str  # original or generated
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +67,8 @@ class MotionPlan:
     object_uid: str  # as drawn: of the mirror image where a recorded motion is mirrored
     sequence_id: str  # of the recorded motion; empty: simulated
     hand_side: str  # right or left
+    licence: str  # of the object, as it was allowed; the worker refuses another one
+    appearance: str  # original or generated, likewise
     split: str
     n_cameras: int
     n_frames: int
@@ -134,6 +138,8 @@ def make_plan(
                 object_uid=uid,
                 sequence_id=candidate.sequence_id,
                 hand_side="left" if is_left else "right",
+                licence=candidate.licence,
+                appearance=candidate.appearance,
                 split=split_of_object(uid, split_rule),
                 n_cameras=n_cameras,
                 n_frames=n_frames,

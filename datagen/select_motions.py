@@ -1,5 +1,7 @@
 """Selection of a whole dataset: every candidate decided once, resumable, kept in selection.parquet."""
 
+import difflib
+import fcntl
 import functools
 import hashlib
 import json
@@ -15,11 +17,20 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from datagen.config import DatasetConfig
+from datagen.config import DatasetConfig, placeless
 from datagen.grasps.graspxl import SequenceFile
-from datagen.library import open_library
+from datagen.input_error import InputError
+from datagen.library import library_state, open_library
 from datagen.motion_source import recorded_sequences
-from datagen.selection import Decision, decide_object, read_takedown
+from datagen.plan import PLAN_FILE
+from datagen.selection import (
+    Decision,
+    decide_object,
+    names_of,
+    normalised_name,
+    own_entries,
+    read_takedown,
+)
 
 __all__ = ["SELECTION_FILE", "Selection", "select_motions"]
 
@@ -34,6 +45,7 @@ class Selection:
     """All decisions, objects in library order, sequences in natural order."""
 
     decisions: tuple[Decision, ...]
+    unmatched: tuple[str, ...]  # entries of the user's takedown list that name nothing here
 
     @property
     def kept(self) -> tuple[Decision, ...]:
@@ -58,26 +70,70 @@ def select_motions(
     """Decide on every candidate of `config` and write `out`/selection.parquet.
 
     A file that is there and was made of the same rules, takedown list and candidates is read
-    instead; a run that was stopped is continued. `report` gets (objects done, objects in all).
+    instead; a run that was stopped is continued; a second process waits. `report` gets (objects
+    done, objects in all). InputError when `out` holds a plan that was made from another selection.
     """
-    takedown = read_takedown(config.selection.takedown)
-    tasks = _tasks(config)
-    key = _key(config, takedown, tasks)
-    path = out / SELECTION_FILE
-    known = _read(path, key)
-    if known is not None:
-        return known
     out.mkdir(parents=True, exist_ok=True)
-    with _progress_file(out / _PARTIAL, key) as (done, remember):
-        waiting = [task for task in tasks if task.uid not in done]
-        for count, (task, decisions) in enumerate(zip(waiting, _decided(config, takedown, waiting, workers))):
-            remember(task.uid, decisions)
-            if report is not None:
-                report(len(tasks) - len(waiting) + count + 1, len(tasks))
-        selection = Selection(decisions=tuple(d for task in tasks for d in done[task.uid]))
-    _write(selection, path, key)
-    (out / _PARTIAL).unlink()
+    with _lock(out / ".selection.lock"):
+        takedown = read_takedown(config.selection.takedown)
+        tasks = _tasks(config)
+        known_names = _known_names(tasks)
+        _require_known_exclusions(config, known_names)
+        unmatched = tuple(sorted(own_entries(config.selection.takedown) - known_names))
+        key = _key(config, takedown, tasks)
+        path = out / SELECTION_FILE
+        known = _read(path, key, unmatched)
+        if known is not None:
+            return known
+        if (out / PLAN_FILE).exists() and path.exists():
+            raise InputError(
+                path,
+                "belongs to the plan beside it, and objects, recordings, rules or takedown list have changed since",
+                expected="the selection that the plan was made from",
+                action="Select into another --out. Rendering goes on with the plan as it is; what is taken "
+                "down is skipped.",
+            )
+        with _progress_file(out / _PARTIAL, key) as (done, remember):
+            waiting = [task for task in tasks if task.uid not in done]
+            decided = _decided(config, takedown, waiting, workers)
+            for count, (task, of_task) in enumerate(zip(waiting, decided)):
+                remember(task.uid, of_task)
+                if report is not None:
+                    report(len(tasks) - len(waiting) + count + 1, len(tasks))
+            decisions = tuple(decision for task in tasks for decision in done[task.uid])
+        selection = Selection(decisions=decisions, unmatched=unmatched)
+        _write(selection, path, key)
+        (out / _PARTIAL).unlink()
     return selection
+
+
+@contextmanager
+def _lock(path: Path) -> Iterator[None]:
+    """One process at a time in this folder; the lock ends with the process."""
+    with path.open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _known_names(tasks: Sequence["_Task"]) -> frozenset[str]:
+    """Everything that a list may name here."""
+    names: set[str] = set()
+    for task in tasks:
+        names |= names_of(task.uid)
+        names |= {file.sequence_id for file in task.sequences}
+    return frozenset(names)
+
+
+def _require_known_exclusions(config: DatasetConfig, known_names: frozenset[str]) -> None:
+    unknown = sorted({normalised_name(entry) for entry in config.objects.exclude} - known_names)
+    if unknown:
+        close = difflib.get_close_matches(unknown[0], known_names, n=1)
+        raise InputError(
+            "objects.exclude",
+            f"names {', '.join(unknown[:3])}, which the library does not have",
+            expected="uids of its objects",
+            action=f"Did you mean {close[0]!r}?" if close else "Take it out.",
+        )
 
 
 def _tasks(config: DatasetConfig) -> list[_Task]:
@@ -93,13 +149,15 @@ def _tasks(config: DatasetConfig) -> list[_Task]:
 
 
 def _key(config: DatasetConfig, takedown: frozenset[str], tasks: Sequence[_Task]) -> str:
-    """Of all that decides: rules, takedown list and candidates."""
+    """Of all that decides: rules, takedown list, candidates, and what the object store holds of them."""
+    somewhere = placeless(config)
     decisive = json.dumps(
         [
-            asdict(config.selection),
+            asdict(somewhere.selection),
             sorted(takedown),
-            asdict(config.objects),
+            asdict(somewhere.objects),
             [(task.uid, [file.sequence_id for file in task.sequences]) for task in tasks],
+            library_state(config.objects),
         ],
         default=str,
     )
@@ -114,7 +172,8 @@ def _decided(
     if workers == 1:
         yield from decide(tasks)
         return
-    chunks = [tasks[start : start + _CHUNK] for start in range(0, len(tasks), _CHUNK)]
+    size = max(_CHUNK, len(tasks) // (16 * workers))  # opening a large store takes seconds
+    chunks = [tasks[start : start + size] for start in range(0, len(tasks), size)]
     with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
         for decided in pool.map(functools.partial(_decide_all, config, takedown), chunks):
             yield from decided
@@ -124,7 +183,7 @@ def _decide(
     config: DatasetConfig, takedown: frozenset[str], tasks: Sequence[_Task]
 ) -> Iterator[list[Decision]]:
     library = open_library(config.objects, config.motions)
-    excluded = frozenset(config.objects.exclude)
+    excluded = frozenset(normalised_name(entry) for entry in config.objects.exclude)
     for task in tasks:
         yield decide_object(
             task.uid, task.sequences, library, config.selection, excluded=excluded, takedown=takedown
@@ -179,7 +238,7 @@ def _write(selection: Selection, path: Path, key: str) -> None:
     os.replace(file.name, path)
 
 
-def _read(path: Path, key: str) -> Selection | None:
+def _read(path: Path, key: str, unmatched: tuple[str, ...]) -> Selection | None:
     """The selection of `path` where it is of the same key; a damaged or other one is made again."""
     if not path.is_file():
         return None
@@ -187,6 +246,7 @@ def _read(path: Path, key: str) -> Selection | None:
         table = pq.read_table(path, page_checksum_verification=True)
         if (table.schema.metadata or {}).get(_KEY) != key.encode():
             return None
-        return Selection(decisions=tuple(Decision(**row) for row in table.to_pylist()))
+        decisions = tuple(Decision(**row) for row in table.to_pylist())
+        return Selection(decisions=decisions, unmatched=unmatched)
     except (pa.ArrowException, OSError, TypeError):
         return None

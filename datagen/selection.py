@@ -5,23 +5,26 @@ threshold is a setting and every decision is recorded with its figures (`selecti
 Rules apply in the order of `Rule`; the first one that a motion breaks removes it.
 """
 
+import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from importlib.resources import files
 from pathlib import Path
 from typing import Literal
 
-from datagen.grasps.graspxl import SequenceFile, read_sequence
+from datagen.grasps.graspxl import LICENCE, SequenceFile, read_sequence
 from datagen.grasps.movement import measure_movement
 from datagen.input_error import InputError
 from datagen.objects.description import ObjectDescription
 from datagen.objects.errors import ObjectError
 from datagen.objects.library import ObjectLibrary
 from datagen.objects.licences import spdx_of
+from datagen.objects.mirror import unmirrored_uid
 from datagen.objects.texture_quality import TextureQuality
 from datagen.plan import Candidate
+from shards.splits import object_identity
 
 __all__ = [
     "AnnotationRule",
@@ -31,10 +34,15 @@ __all__ = [
     "SelectionConfig",
     "TextureRule",
     "decide_object",
+    "names_of",
+    "normalised_name",
+    "own_entries",
     "read_takedown",
     "removed_by_rule",
+    "taken_down",
 ]
 
+_OBJAVERSE_ID = re.compile(r"[0-9a-f]{32}$")
 _NAN = float("nan")
 
 
@@ -107,6 +115,7 @@ class Decision:
     rule: str  # that removed it; empty when kept
     reason: str  # with figures
     licence: str
+    appearance: str  # original or generated
     texture_resolution_px: float
     color_detail: float
     rise_m: float
@@ -115,27 +124,64 @@ class Decision:
 
     @property
     def candidate(self) -> Candidate:
-        return Candidate(object_uid=self.object_uid, sequence_id=self.sequence_id)
+        return Candidate(
+            object_uid=self.object_uid,
+            sequence_id=self.sequence_id,
+            licence=self.licence,
+            appearance=self.appearance,
+        )
 
 
 def read_takedown(path: Path | None) -> frozenset[str]:
-    """Uids and sequence ids of the project's own takedown list, and of a user's.
+    """Names on the project's own takedown list and on a user's.
 
     InputError when the user's file is missing: never an empty list instead.
     """
-    text = (files("datagen.objects") / "data" / "takedown.txt").read_text(encoding="utf-8")
-    if path is not None:
-        try:
-            text += "\n" + path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(
-                path,
-                f"cannot be read ({error})",
-                expected="the takedown list of selection.takedown, a text file",
-                action="Correct the path, or set selection.takedown to null.",
-            ) from error
+    ours = (files("datagen.objects") / "data" / "takedown.txt").read_text(encoding="utf-8")
+    return _entries(ours) | own_entries(path)
+
+
+def own_entries(path: Path | None) -> frozenset[str]:
+    """Names on a user's list. InputError when the file is missing."""
+    if path is None:
+        return frozenset()
+    try:
+        return _entries(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            path,
+            f"cannot be read ({error})",
+            expected="the takedown list of selection.takedown, a text file",
+            action="Correct the path, or set selection.takedown to null.",
+        ) from error
+
+
+def _entries(text: str) -> frozenset[str]:
     entries = (line.partition("#")[0].strip() for line in text.splitlines())
-    return frozenset(entry for entry in entries if entry)
+    return frozenset(normalised_name(entry) for entry in entries if entry)
+
+
+def taken_down(uid: str, sequence_id: str, takedown: frozenset[str]) -> str | None:
+    """The entry of a takedown list that names this motion, or None."""
+    named = takedown & (names_of(uid) | {sequence_id})
+    return min(named) if named else None
+
+
+def names_of(uid: str) -> frozenset[str]:
+    """What an object may be called in a list: its uid at this size, itself, or its bare Objaverse id."""
+    unmirrored = unmirrored_uid(uid)
+    identity = object_identity(unmirrored)
+    bare = identity.rpartition("/")[2]
+    return frozenset({unmirrored, identity} | ({bare} if _OBJAVERSE_ID.fullmatch(bare) else set()))
+
+
+def normalised_name(entry: str) -> str:
+    """An entry as `names_of` and sequence ids spell it: of a link to a model its id, no mirror images."""
+    at_end = _OBJAVERSE_ID.search(entry.lower().rstrip("/"))
+    if "://" in entry and at_end is not None:
+        return at_end[0]
+    found = unmirrored_uid(entry)
+    return found.lower() if _OBJAVERSE_ID.fullmatch(found.lower()) else found
 
 
 def decide_object(
@@ -153,7 +199,7 @@ def decide_object(
     `unusable: stop` the ObjectError itself is raised.
     """
     ids = [file.sequence_id for file in sequences] or [""]
-    described = _Described(licence="", texture=None)
+    described = _Described(licence="", appearance="", texture=None)
     removed = _by_name(uid, excluded, takedown)
     if removed is None:
         try:
@@ -164,7 +210,7 @@ def decide_object(
             removed = Rule.UNUSABLE, str(error)
     if removed is not None or not sequences:
         return [_decision(uid, sequence_id, removed, described) for sequence_id in ids]
-    return [_recorded(file, uid, described, config.movement, takedown) for file in sequences]
+    return [_recorded(file, uid, described, config, takedown) for file in sequences]
 
 
 def removed_by_rule(decisions: Sequence[Decision]) -> dict[Rule, tuple[int, int]]:
@@ -182,29 +228,37 @@ class _Described:
     """What is known of an object when a decision falls."""
 
     licence: str
+    appearance: str
     texture: TextureQuality | None
 
 
 def _by_name(uid: str, excluded: frozenset[str], takedown: frozenset[str]) -> Removed:
-    if uid in excluded:
+    if names_of(uid) & excluded:
         return Rule.EXCLUDED, "named in objects.exclude"
-    identity = uid.partition("@")[0]
-    named = takedown & {uid, identity, identity.rpartition("/")[2]}
-    return (Rule.TAKEDOWN, f"listed as {min(named)}") if named else None
+    entry = taken_down(uid, "", takedown)
+    return None if entry is None else (Rule.TAKEDOWN, f"listed as {entry}")
 
 
 def _by_object(library: ObjectLibrary, uid: str, config: SelectionConfig) -> tuple[Removed, _Described]:
     """Licence and annotation first: they cost nothing; the texture is measured only of what passes."""
     description = library.describe(uid)
-    known = _Described(licence=description.licence, texture=None)
-    allowed = {spdx_of(name) for name in config.licence_allow}
-    if description.licence not in allowed:
-        return (Rule.LICENCE, f"{description.licence}; allowed: {', '.join(sorted(allowed))}"), known
+    known = _Described(licence=description.licence, appearance=description.appearance, texture=None)
+    removed = _by_licence(description.licences, description.licence, config)
+    if removed is not None:
+        return removed, known
     removed = _by_annotation(description, config.annotation)
     if removed is not None:
         return removed, known
     texture = library.texture_quality(uid)
-    return _by_texture(texture, config.texture), _Described(licence=description.licence, texture=texture)
+    return _by_texture(texture, config.texture), replace(known, texture=texture)
+
+
+def _by_licence(licences: Sequence[str], name: str, config: SelectionConfig) -> Removed:
+    """Every part of a licence must be allowed."""
+    allowed = {spdx_of(allow) for allow in config.licence_allow}
+    return (
+        None if set(licences) <= allowed else (Rule.LICENCE, f"{name}; allowed: {', '.join(sorted(allowed))}")
+    )
 
 
 def _by_annotation(described: ObjectDescription, rule: AnnotationRule) -> Removed:
@@ -212,7 +266,8 @@ def _by_annotation(described: ObjectDescription, rule: AnnotationRule) -> Remove
     if noted is None:
         return None
     checks = (
-        (noted.texture_count is not None and noted.texture_count < rule.min_textures,
+        (described.appearance == "original" and noted.texture_count is not None
+         and noted.texture_count < rule.min_textures,
          f"{noted.texture_count} textures, at least {rule.min_textures} wanted"),
         (noted.face_count is not None and noted.face_count > rule.max_faces,
          f"{noted.face_count} faces, at most {rule.max_faces} wanted"),
@@ -234,9 +289,13 @@ def _recorded(
     file: SequenceFile,
     uid: str,
     described: _Described,
-    rule: MovementRule,
+    config: SelectionConfig,
     takedown: frozenset[str],
 ) -> Decision:
+    rule = config.movement
+    motion_licence = _by_licence([LICENCE], f"of the recorded motion: {LICENCE}", config)
+    if motion_licence is not None:
+        return _decision(uid, file.sequence_id, motion_licence, described)
     if file.sequence_id in takedown:
         return _decision(uid, file.sequence_id, (Rule.TAKEDOWN, f"listed as {file.sequence_id}"), described)
     try:
@@ -272,6 +331,7 @@ def _decision(
         rule="" if removed is None else removed[0].value,
         reason="" if removed is None else removed[1],
         licence=described.licence,
+        appearance=described.appearance,
         texture_resolution_px=_NAN if texture is None else float(texture.texture_resolution_px),
         color_detail=_NAN if texture is None else texture.color_detail,
         rise_m=movement[0],

@@ -70,14 +70,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--license-allow", type=lambda text: tuple(text.split(",")))
     options = parser.parse_args(arguments)
     die_with_parent()
-    job = Job(
-        config=load_config(options.config, licence_allow=options.license_allow),
-        motion=read_plan(options.out / PLAN_FILE).motions[options.motion],
-        out=options.out,
-        device=options.device,
-        threads=options.threads,
-    )
     try:
+        job = Job(
+            config=load_config(options.config, licence_allow=options.license_allow),
+            motion=read_plan(options.out / PLAN_FILE).motions[options.motion],
+            out=options.out,
+            device=options.device,
+            threads=options.threads,
+        )
         run_job(job)
     except (InputError, ShardError) as error:
         _refuse(error)

@@ -59,7 +59,10 @@ class ObjectRow:
     )
     name: str = column("string", meaning="Short human name.")
     source: str = column("string", meaning="Collection the object comes from.")
-    licence: str = column("string", meaning="SPDX identifier of the object's licence.")
+    licence: str = column(
+        "string",
+        meaning="SPDX expression of the object's licence; with AND where a mesh derives from another work.",
+    )
     author: str = column("string", meaning="Who to credit.")
     url: str = column("string", meaning="Where the object was published.")
     mesh_glb: bytes | None = column(
@@ -124,6 +127,11 @@ class ObjectRow:
         "int32", unit="px", meaning="Longest side of the largest base-colour image; 0 without one."
     )
     color_detail: float = column("float32", meaning="Colour detail of the texture; larger is richer.")
+    appearance: str = column(
+        "string",
+        choices=("original", "generated"),
+        meaning="Whether colours and textures are the object's own, or generated for a mesh that has none.",
+    )
     registration_residual: float = column(
         "float32",
         allow_nan=True,
@@ -200,7 +208,11 @@ class ClipRow:
         "float32", unit="m", allow_nan=True, meaning="Hand centre to object centre at the end."
     )
     max_penetration_m: float = column(
-        "float32", unit="m", allow_nan=True, meaning="Deepest hand vertex inside the object, worst instant."
+        "float32",
+        unit="m",
+        allow_nan=True,
+        meaning="Deepest hand vertex inside the object, over sampled instants: of the whole motion when simulated, "
+        "every fifth frame from the grasp on when recorded.",
     )
     digits_in_contact: int = column("int32", meaning="Digits that touch at the end, 0..5; -1 not measured.")
     slip_lift_m: float = column(

@@ -4,7 +4,7 @@ import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["Split", "SplitRule", "split_of_object"]
+__all__ = ["Split", "SplitRule", "object_identity", "split_of_object"]
 
 Split = Literal["train", "val", "test"]
 
@@ -25,15 +25,21 @@ class SplitRule:
             )
 
 
+def object_identity(object_uid: str) -> str:
+    """The uid without its variant: what follows an "@" in the last part of the path."""
+    folder, slash, name = object_uid.rpartition("/")
+    return folder + slash + name.partition("@")[0]
+
+
 def split_of_object(object_uid: str, rule: SplitRule) -> Split:
     """The split of an object. Depends on nothing but the uid and the rule.
 
-    What follows an "@" names a variant (another size, the mirror image) and does not count, so
-    variants never straddle splits. The first 8 bytes of SHA-256 of the rest, as a fraction u of
+    Variants (another size, the mirror image) do not count (`object_identity`), so they never
+    straddle splits. The first 8 bytes of SHA-256 of the rest, as a fraction u of
     2^64: test if u < test, val if u < test + val, else train. Raising val_fraction moves objects
     from train only.
     """
-    identity = object_uid.partition("@")[0]
+    identity = object_identity(object_uid)
     word = int.from_bytes(hashlib.sha256(identity.encode("utf-8")).digest()[:8], "big")
     u = word / 2**64
     if u < rule.test_fraction:

@@ -97,13 +97,13 @@ def replay(
             f"{recorded.sequence_id}: the hand sinks {1e3 * depth:.1f} mm into {asset.uid}, allowed "
             f"{1e3 * config.max_penetration_m:g} mm"
         )
-    still = T_hand_from_obj[grasp_frame:, :3, 3] - T_hand_from_obj[grasp_frame, :3, 3]
+    in_hand = _object_in_hand(parameters, hand.joints_rest[0], T_world_from_obj)[grasp_frame:, :3, 3]
     quality = GraspQuality(
         rise_m=float(T_world_from_obj[-1, 2, 3] - T_world_from_obj[0, 2, 3]),
         center_distance_m=float(np.linalg.norm(hand_center(posed)[-1] - T_world_from_obj[-1, :3, 3])),
         max_penetration_m=depth,
         digits_in_contact=int(touching[-1]),
-        slip_lift_m=float(np.linalg.norm(still, axis=1).max()),
+        slip_lift_m=float(np.linalg.norm(in_hand - in_hand[0], axis=1).max()),
         slip_manipulation_m=_NAN,
         contact_force_n=_NAN,
         attempts=0,
@@ -167,7 +167,7 @@ def _object_in_hand(
     wrist_rest: Float[np.ndarray, "3"],
     T_world_from_obj: Float[np.ndarray, "frame 4 4"],
 ) -> Float[np.ndarray, "frame 4 4"]:
-    """Object pose seen from the recorded wrist."""
+    """Object pose seen from a wrist that rests at `wrist_rest`."""
     T_world_from_hand = np.tile(np.eye(4), (len(T_world_from_obj), 1, 1))
     T_world_from_hand[:, :3, :3] = Rotation.from_rotvec(parameters.orientation_world).as_matrix()
     T_world_from_hand[:, :3, 3] = parameters.translation_world + wrist_rest

@@ -15,3 +15,8 @@ class ReplayOutcome:
     sequence: GraspSequence | None
     reason: str
     cpu_seconds: float
+
+    @classmethod
+    def refused(cls, sequence_id: str, reason: str) -> "ReplayOutcome":
+        """A motion that was not replayed."""
+        return cls(sequence_id=sequence_id, sequence=None, reason=reason, cpu_seconds=0.0)

@@ -16,7 +16,7 @@ from datagen.hands.skin import SkinBasis, nearest_texels
 from datagen.input_error import InputError
 from datagen.restricted_pickle import load_restricted_pickle
 
-__all__ = ["HtmlSkin", "load_html_skin"]
+__all__ = ["HtmlSkin", "find_html", "load_html_skin"]
 
 _TEXTURE_PX = 1024
 _WHOLE, _ANY = "iu", "iuf"  # kinds of NumPy numbers
@@ -52,9 +52,8 @@ def load_html_skin(
                 "load_html_skin needs right_faces, the faces of the right model, for a left hand"
             )
         right_faces = model.faces
-    inner = folder / "TextureBasis"
-    root = inner if inner.is_dir() else folder
-    if not (root / variant / "model.pkl").is_file():
+    root = find_html(folder, variant)
+    if root is None:
         raise _wrong(
             folder, f"holds no TextureBasis/{variant}/model.pkl", f"TextureBasis with {variant} and uvs.pkl"
         )
@@ -64,6 +63,12 @@ def load_html_skin(
     return HtmlSkin(
         basis=basis, corner_uv=_uv_on(path, _corner_uv(path, len(right_faces)), right_faces, model)
     )
+
+
+def find_html(folder: Path, variant: Literal["model_sr", "model_wosr"] = "model_sr") -> Path | None:
+    """The TextureBasis folder in `folder` (or `folder` itself) that holds the variant, or None."""
+    places = (folder / "TextureBasis", folder)
+    return next((place for place in places if (place / variant / "model.pkl").is_file()), None)
 
 
 def _wrong(path: Path, problem: str, expected: str) -> InputError:

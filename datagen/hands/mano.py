@@ -33,7 +33,9 @@ _SURE_CORRELATION = 0.1
 
 
 def find_mano(folder: Path, side: Side) -> Path | None:
-    """MANO_RIGHT.pkl or MANO_LEFT.pkl in a folder or where the official zip and smplx put it below."""
+    """MANO_RIGHT.pkl or MANO_LEFT.pkl in a folder (or that file itself), or where the zip and smplx put it."""
+    if folder.is_file() and folder.name == _file_name(side):
+        return folder
     places = [folder / sub / _file_name(side) for sub in _SUBFOLDERS]
     return next((path for path in places if path.is_file()), None)
 

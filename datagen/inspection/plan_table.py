@@ -6,6 +6,7 @@ from pathlib import Path
 from rich.table import Table
 
 from datagen.plan import Plan
+from shards.splits import object_identity
 
 __all__ = ["plan_table"]
 
@@ -20,7 +21,7 @@ def plan_table(plan: Plan, out: Path) -> Table:
         motions = [motion for motion in plan.motions if split in (motion.split, "all")]
         table.add_row(
             split,
-            f"{len({motion.object_uid for motion in motions}):,}",
+            f"{len({object_identity(motion.object_uid) for motion in motions}):,}",
             f"{len(motions):,}",
             f"{sum(motion.n_cameras for motion in motions):,}",
             f"{sum(motion.n_cameras * motion.n_frames for motion in motions):,}",

@@ -39,7 +39,7 @@ def replay_table(outcomes: Sequence[ReplayOutcome]) -> Table:
         hand = replayed[0][1]
         if hand.stands_in_for:
             lines.append(f"{hand.hand_model} stands in for {hand.stands_in_for}: contacts are approximate")
-        lines.append(f"{np.median([outcome.cpu_seconds for outcome in outcomes]):.1f} s of CPU per motion")
+        lines.append(f"{np.median([outcome.cpu_seconds for outcome, _ in replayed]):.1f} s of CPU per motion")
     refused = [f"left out: {outcome.reason}" for outcome in outcomes if outcome.sequence is None]
     table.caption = "\n".join([*lines, *refused])
     table.caption_justify = "left"

@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
+from datagen.select_motions import Selection
 from datagen.selection import Decision, removed_by_rule
 
-__all__ = ["selection_line", "selection_table"]
+__all__ = ["selection_lines", "selection_table"]
 
 
 def selection_table(decisions: Sequence[Decision]) -> Table:
@@ -25,11 +26,17 @@ def selection_table(decisions: Sequence[Decision]) -> Table:
     return table
 
 
-def selection_line(decisions: Sequence[Decision]) -> str:
-    """What was removed, in one line."""
+def selection_lines(selection: Selection) -> list[str]:
+    """What was removed, in one line, and what the takedown list names in vain."""
     removed = [
-        f"{motions:,} {rule.value}" for rule, (motions, _) in removed_by_rule(decisions).items() if motions
+        f"{motions:,} {rule.value}"
+        for rule, (motions, _) in removed_by_rule(selection.decisions).items()
+        if motions
     ]
-    kept = sum(decision.kept for decision in decisions)
     reasons = f"; removed: {', '.join(removed)}" if removed else ""
-    return f"selection: {kept:,} of {len(decisions):,} motions kept{reasons}"
+    lines = [f"selection: {len(selection.kept):,} of {len(selection.decisions):,} motions kept{reasons}"]
+    if selection.unmatched:
+        lines.append(
+            f"entries of your takedown list that name nothing here: {', '.join(selection.unmatched)}"
+        )
+    return lines

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float, Int
 
+from datagen.objects.description import Appearance
 from datagen.objects.mesh import ObjectMesh
 from datagen.objects.registration import Registration
 from datagen.objects.texture_quality import TextureQuality
@@ -55,7 +56,7 @@ class ObjectAsset:
     uid: str
     name: str
     source: str
-    licence: str  # SPDX id, "LicenseRef-..." where there is none
+    licence: str  # SPDX id ("LicenseRef-..." where there is none), or several that apply: "A AND B"
     author: str
     url: str
     mesh: ObjectMesh
@@ -65,3 +66,4 @@ class ObjectAsset:
     # Axes, unit and centring in one similarity: x_obj = T_obj_from_file @ x_file.
     T_obj_from_file: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     registration: Registration | None = None  # drawn in place of its rescaled copy (GraspXL)
+    appearance: Appearance = "original"

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.objects.draco import DRACO, decoded_primitive
+from datagen.objects.draco import DRACO, DracoPrimitive, decoded_primitive
 from datagen.objects.errors import ObjectError
 from datagen.objects.file_mesh import FileMesh
-from datagen.objects.gltf_file import MAX_FILE_MB, GltfFile, open_gltf
+from datagen.objects.gltf_file import MAX_FILE_MB, GltfFile, damaged_gltf, open_gltf
 from datagen.objects.gltf_materials import SPECULAR_GLOSS, UNLIT, WEBP, read_material, transformed_uv, uv_set
 from datagen.objects.mesh import Material
 
@@ -30,6 +30,7 @@ IMPLEMENTED = (
 )
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
+WIDTHS = {"POSITION": (3,), "COLOR_0": (3, 4)}  # components of a row; 2 for coordinates of textures
 UNLIT_GREY = Material(name="unnamed", base_color_rgba=(1.0, 1.0, 1.0, 1.0), roughness=1.0)
 
 
@@ -48,22 +49,30 @@ def read_gltf(path: Path, data: bytes, *, max_file_mb: float = MAX_FILE_MB) -> F
     """All triangles of the default scene. Axes Y-up, metres (as the format says).
 
     `data` is the file's content; `path` finds files beside it (each up to `max_file_mb`) and names
-    it in errors.
+    it in errors. Whatever is wrong with the file is an ObjectError.
     """
-    file = open_gltf(path, data, max_file_mb=max_file_mb)
+    try:
+        return _scene_mesh(open_gltf(path, data, max_file_mb=max_file_mb))
+    except ObjectError:
+        raise
+    except LookupError as error:
+        raise damaged_gltf(path, f"refers to something that is not there ({error!r})") from error
+    except Exception as error:  # a value of a wrong type or size fails anywhere, as anything
+        raise damaged_gltf(path, f"cannot be parsed ({error!r})") from error
+
+
+def _scene_mesh(file: GltfFile) -> FileMesh:
     _refuse_unknown_extensions(file)
     _refuse_what_moves(file)
-    try:
-        materials = [read_material(file, entry) for entry in file.json.get("materials", [])]
-        pieces = [
-            _piece(file, primitive, T_scene_from_node, len(materials))
-            for mesh, T_scene_from_node in _placed_meshes(file)
-            for primitive in file.json["meshes"][mesh]["primitives"]
-            if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)
-        ]
-    except (KeyError, IndexError, TypeError) as error:
-        raise file.damaged(f"refers to something that is not there ({error!r})") from error
-    return _joined(pieces, (*materials, UNLIT_GREY))
+    listed = [read_material(file, entry) for entry in file.json.get("materials", [])]
+    materials = (*listed, UNLIT_GREY)  # the last one is of primitives that name none
+    pieces = [
+        _piece(file, primitive, T_scene_from_node, materials)
+        for mesh, T_scene_from_node in _placed_meshes(file)
+        for primitive in file.entry("meshes", mesh)["primitives"]
+        if primitive.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)
+    ]
+    return _joined(pieces, materials)
 
 
 def _refuse_unknown_extensions(file: GltfFile) -> None:
@@ -126,14 +135,14 @@ def _placed_meshes(file: GltfFile) -> list[tuple[int, Float[np.ndarray, "4 4"]]]
     children = {child for node in nodes for child in node.get("children", [])}
     roots = [index for index in range(len(nodes)) if index not in children]
     if scenes:
-        roots = scenes[file.json.get("scene", 0)].get("nodes", [])
+        roots = file.entry("scenes", file.json.get("scene", 0)).get("nodes", [])
     placed, stack, visited = [], [(root, np.eye(4)) for root in reversed(roots)], 0
     while stack:
         index, T_scene_from_parent = stack.pop()
         visited += 1
         if visited > len(nodes):
             raise file.damaged("its node tree has a cycle")
-        node = nodes[index]
+        node = file.entry("nodes", index)
         T_scene_from_node = T_scene_from_parent @ _node_matrix(node)
         if "mesh" in node:
             placed.append((node["mesh"], T_scene_from_node))
@@ -142,36 +151,62 @@ def _placed_meshes(file: GltfFile) -> list[tuple[int, Float[np.ndarray, "4 4"]]]
 
 
 def _piece(
-    file: GltfFile, primitive: dict[str, Any], T_scene_from_node: Float[np.ndarray, "4 4"], n_materials: int
+    file: GltfFile,
+    primitive: dict[str, Any],
+    T_scene_from_node: Float[np.ndarray, "4 4"],
+    materials: tuple[Material, ...],
 ) -> _Piece:
     packed = decoded_primitive(file, primitive)
-
-    def rows(name: str) -> np.ndarray | None:
-        if packed is not None and name in packed.attributes:
-            return packed.attributes[name]
-        accessor = primitive["attributes"].get(name)
-        return None if accessor is None else file.accessor(accessor)
-
-    positions = rows("POSITION")
+    positions = _attribute(file, primitive, packed, "POSITION")
     if positions is None:
         raise file.damaged("a primitive has no POSITION")
     verts = positions.astype(np.float64) @ T_scene_from_node[:3, :3].T + T_scene_from_node[:3, 3]
     faces = packed.faces if packed is not None else _plain_faces(file, primitive, len(verts))
-    if len(faces) and (faces.max() >= len(verts)):
+    if not ((faces >= 0) & (faces < len(verts))).all():
         raise file.damaged("a face refers to a vertex that is not there")
     if np.linalg.det(T_scene_from_node[:3, :3]) < 0:
         faces = faces[:, ::-1]
-    material = primitive.get("material", n_materials)
-    uv, colors = rows(uv_set(file, material)), rows("COLOR_0")
-    if uv is None:
-        uv = np.zeros((len(verts), 2))
-    else:
-        uv = transformed_uv(file, material, uv.astype(np.float64)) * [1.0, -1.0] + [0.0, 1.0]
-    if colors is not None:
-        colors = colors[:, :3].astype(np.float64)
+    material = primitive.get("material", len(materials) - 1)
+    if "material" in primitive:
+        file.entry("materials", material)
+    uv = _attribute(file, primitive, packed, uv_set(file, material))
+    colors = _attribute(file, primitive, packed, "COLOR_0")
     if any(len(column) != len(verts) for column in (uv, colors) if column is not None):
         raise file.damaged("the attributes of a primitive differ in length")
-    return _Piece(verts=verts, faces=faces, uv=uv, colors=colors, material=material)
+    uv = np.zeros((len(verts), 2)) if uv is None else _upright_uv(file, material, uv)
+    if not np.isfinite(uv[faces]).all():
+        if materials[material].base_color_image is not None:
+            raise file.damaged("texture coordinates of a primitive are NaN or infinite")
+        uv = np.zeros_like(uv)  # nothing is drawn by them
+    return _Piece(
+        verts=verts,
+        faces=faces,
+        uv=uv,
+        colors=None if colors is None else colors[:, :3].astype(np.float64),
+        material=material,
+    )
+
+
+def _attribute(
+    file: GltfFile, primitive: dict[str, Any], packed: DracoPrimitive | None, name: str
+) -> np.ndarray | None:
+    """Rows of one attribute; None where the primitive has none of this name."""
+    if packed is not None and name in packed.attributes:
+        found = packed.attributes[name]
+    elif name in primitive["attributes"]:
+        found = file.accessor(primitive["attributes"][name])
+    else:
+        return None
+    if found.ndim != 2 or found.shape[1] not in WIDTHS.get(name, (2,)):
+        raise file.damaged(f"{name} of a primitive has the shape {found.shape}")
+    return found
+
+
+def _upright_uv(
+    file: GltfFile, material: int, uv: Float[np.ndarray, "vert 2"]
+) -> Float[np.ndarray, "vert 2"]:
+    """With (0, 0) at the lower left, where glTF has the upper left."""
+    return transformed_uv(file, material, uv.astype(np.float64)) * [1.0, -1.0] + [0.0, 1.0]
 
 
 def _plain_faces(file: GltfFile, primitive: dict[str, Any], n_verts: int) -> Int[np.ndarray, "face 3"]:

@@ -1,10 +1,11 @@
 """Materials of glTF 2.0 as metallic-roughness, and which UV coordinates they use."""
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from PIL import Image
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.gltf_file import GltfFile
@@ -27,43 +28,43 @@ def read_material(file: GltfFile, entry: dict[str, Any]) -> Material:
     """
     extensions = entry.get("extensions", {})
     look = extensions.get(SPECULAR_GLOSS)
-    strength = extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+    strength = _number(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
     shading = _metallic_roughness(file, entry) if look is None else _specular_gloss(file, look)
     if UNLIT in extensions:
         shading |= {"metallic": 0.0, "roughness": UNLIT_ROUGHNESS, "metallic_roughness_image": None}
     return Material(
-        name=entry.get("name", "unnamed"),
+        name=str(entry.get("name", "unnamed")),
         **shading,
         normal_image=_texture(file, entry.get("normalTexture")),
-        emissive_rgb=tuple(float(strength * value) for value in entry.get("emissiveFactor", (0, 0, 0))),  # type: ignore[arg-type]
+        emissive_rgb=tuple(strength * value for value in _numbers(entry.get("emissiveFactor", (0, 0, 0)), 3)),  # type: ignore[arg-type]
         emissive_image=_texture(file, entry.get("emissiveTexture")),
-        transmission=float(extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0)),
-        ior=float(extensions.get("KHR_materials_ior", {}).get("ior", 1.45)),
+        transmission=_number(extensions.get("KHR_materials_transmission", {}).get("transmissionFactor", 0)),
+        ior=_number(extensions.get("KHR_materials_ior", {}).get("ior", 1.45)),
     )
 
 
 def _metallic_roughness(file: GltfFile, entry: dict[str, Any]) -> dict[str, Any]:
     pbr = entry.get("pbrMetallicRoughness", {})
     return {
-        "base_color_rgba": tuple(map(float, pbr.get("baseColorFactor", (1, 1, 1, 1)))),
+        "base_color_rgba": _numbers(pbr.get("baseColorFactor", (1, 1, 1, 1)), 4),
         "base_color_image": _texture(file, pbr.get("baseColorTexture")),
-        "metallic": float(pbr.get("metallicFactor", 1)),
-        "roughness": float(pbr.get("roughnessFactor", 1)),
+        "metallic": _number(pbr.get("metallicFactor", 1)),
+        "roughness": _number(pbr.get("roughnessFactor", 1)),
         "metallic_roughness_image": _texture(file, pbr.get("metallicRoughnessTexture")),
     }
 
 
 def _specular_gloss(file: GltfFile, look: dict[str, Any]) -> dict[str, Any]:
     stated = SpecularGloss(
-        diffuse_rgba=tuple(map(float, look.get("diffuseFactor", (1, 1, 1, 1)))),  # type: ignore[arg-type]
+        diffuse_rgba=_numbers(look.get("diffuseFactor", (1, 1, 1, 1)), 4),  # type: ignore[arg-type]
         diffuse_image=_texture(file, look.get("diffuseTexture")),
-        specular_rgb=tuple(map(float, look.get("specularFactor", (1, 1, 1)))),  # type: ignore[arg-type]
-        glossiness=float(look.get("glossinessFactor", 1)),
+        specular_rgb=_numbers(look.get("specularFactor", (1, 1, 1)), 3),  # type: ignore[arg-type]
+        glossiness=_number(look.get("glossinessFactor", 1)),
         specular_gloss_image=_texture(file, look.get("specularGlossinessTexture")),
     )
     try:
         converted = metallic_roughness(stated)
-    except (OSError, Image.DecompressionBombError) as error:  # Pillow's, for images it cannot decode
+    except Exception as error:  # Pillow raises whatever its decoders raise
         raise ObjectError(
             file.path,
             f"an image of a specular-gloss material cannot be decoded ({error})",
@@ -73,10 +74,23 @@ def _specular_gloss(file: GltfFile, look: dict[str, Any]) -> dict[str, Any]:
     return dict(vars(converted))
 
 
+def _number(value: object) -> float:
+    """A finite number; ValueError for anything else (`read_gltf` names the file)."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise ValueError(f"a material has {value!r} for a number")
+    return float(value)
+
+
+def _numbers(values: Sequence[object], count: int) -> tuple[float, ...]:
+    if len(values) != count:
+        raise ValueError(f"a material has {len(values)} numbers in place of {count}")
+    return tuple(_number(value) for value in values)
+
+
 def _texture(file: GltfFile, info: dict[str, Any] | None) -> bytes | None:
     if info is None:
         return None
-    texture = file.json["textures"][info["index"]]
+    texture = file.entry("textures", info["index"])
     extensions = texture.get("extensions", {})
     source = extensions.get(WEBP, texture).get("source", texture.get("source"))
     if source is None:

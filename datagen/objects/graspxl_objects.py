@@ -8,16 +8,18 @@ store the textured model is found again in the copy (`registration`) and drawn i
 """
 
 import os
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 from datagen.objects.asset import ObjectAsset
-from datagen.objects.description import ObjectDescription
+from datagen.objects.description import Appearance, ObjectDescription
 from datagen.objects.errors import ObjectError
-from datagen.objects.licences import UNKNOWN_LICENCE
+from datagen.objects.licences import UNKNOWN_LICENCE, joined_licences
 from datagen.objects.mesh import ObjectMesh
-from datagen.objects.objaverse import ObjaverseStore
+from datagen.objects.objaverse import ObjaverseAnnotation, ObjaverseStore
 from datagen.objects.orientation import outward_mesh
 from datagen.objects.plain_look import with_plain_look
 from datagen.objects.preparation import PreparationConfig, cached_solid
@@ -28,6 +30,7 @@ from datagen.objects.texture_quality import TextureQuality, measure_texture_qual
 __all__ = ["SIZES", "GraspXLObjects", "GraspXLTextures"]
 
 SIZES = ("small", "medium", "large")
+UID = re.compile(rf"objaverse/([^/\\@]+)@({'|'.join(SIZES)})")
 ROOT_VARIABLE = "GRASPXL"
 LICENCE = "CC-BY-NC-4.0"
 AUTHORS = "Zhang, Christen, Fan, Hilliges, Song (GraspXL, ECCV 2024)"
@@ -41,6 +44,8 @@ class _Drawn:
     """What is drawn for one object, and whose work it is."""
 
     mesh: ObjectMesh
+    source: str
+    appearance: Appearance
     name: str
     licence: str
     author: str
@@ -56,7 +61,11 @@ class GraspXLObjects:
     no convex parts, as recorded motions need no physics.
 
     `textures`: "none" draws a generated look; "when_present" draws the textured model where the
-    store has it (one that does not match is refused, not replaced); "required" lists those alone.
+    store has it (one that does not match is refused, not replaced); "required" refuses objects
+    whose model the store has not.
+
+    A bare mesh derives from the Objaverse model. With a store, in any mode, its licence is GraspXL's
+    and the model's, and the model's author is named; without one, GraspXL's alone is known.
     """
 
     def __init__(
@@ -79,23 +88,34 @@ class GraspXLObjects:
             )
         # Never "auto": a 3 m thing in these files would be 3 m.
         self._reading = replace(reading, unit="m", up_axis="z")
-        self._store = store if textures != "none" else None
+        self._store, self._textures = store, textures
         self._preparation, self._registration = preparation, registration
         self._cache_dir = cache_dir.expanduser()
-        self._files = _mesh_files(_opened_root(root))
-        if textures == "required" and store is not None:
-            self._files = {uid: file for uid, file in self._files.items() if store.holds(file.stem)}
-            if not self._files:
-                raise ObjectError(
-                    store.root,
-                    "holds the textured model of none of the GraspXL objects",
-                    expected="glbs/000-xxx/<uid>.glb for the uids of GraspXL",
-                    action="Download them with `objaverse.load_objects(uids)`.",
-                )
+        self._root = _opened_root(root)
+        self._uids: tuple[str, ...] | None = None
+        # One of each is enough: there may be 250,000 meshes.
+        if not any(name for size in SIZES for name in _mesh_names(self._root, size)):
+            raise ObjectError(
+                self._root,
+                "holds no <id>/<id>.obj",
+                expected="object_dataset/{small,medium,large}/<id>/<id>.obj",
+                action="Point at object_dataset; the recorded motions are other archives.",
+            )
+        if textures == "required" and store is not None and not self._any_model(store):
+            raise ObjectError(
+                store.root,
+                "holds the textured model of none of the GraspXL objects",
+                expected="glbs/000-xxx/<uid>.glb for the uids of GraspXL",
+                action="Download them with `objaverse.load_objects(uids)`.",
+            )
 
     def uids(self) -> tuple[str, ...]:
-        """All objects at all sizes that are on disk, small to large, by uid."""
-        return tuple(self._files)
+        """All objects at all sizes that are on disk, small to large, by uid; listed once."""
+        if self._uids is None:
+            self._uids = tuple(
+                f"objaverse/{name}@{size}" for size in SIZES for name in sorted(_mesh_names(self._root, size))
+            )
+        return self._uids
 
     def load(self, uid: str) -> ObjectAsset:
         """Read, repair and prepare one mesh; solids come from the cache the second time."""
@@ -105,7 +125,7 @@ class GraspXLObjects:
         return ObjectAsset(
             uid=uid,
             name=drawn.name,
-            source="graspxl",
+            source=drawn.source,
             licence=drawn.licence,
             author=drawn.author,
             url=drawn.url,
@@ -115,14 +135,17 @@ class GraspXLObjects:
             texture=measure_texture_quality(drawn.texture_source),
             T_obj_from_file=read.T_obj_from_file,
             registration=drawn.registration,
+            appearance=drawn.appearance,
         )
 
     def describe(self, uid: str) -> ObjectDescription:
-        """Licence of what will be drawn, with the annotation where that is the textured model."""
+        """Licence of what will be drawn, and the annotation of the model where a store has it."""
         file = self._file(uid)
-        if self._store is not None and self._store.holds(file.stem):
-            return self._store.describe(file.stem)
-        return ObjectDescription(licence=LICENCE)
+        store = self._store_to_draw(file)
+        if store is not None:
+            return store.describe(file.stem)
+        note = self._note(file)
+        return ObjectDescription(licence=_bare_licence(note), annotation=note, appearance="generated")
 
     def texture_quality(self, uid: str) -> TextureQuality:
         """As `load` measures it, without making the solid."""
@@ -131,19 +154,41 @@ class GraspXLObjects:
         return measure_texture_quality(drawn.texture_source)
 
     def _file(self, uid: str) -> Path:
-        if uid not in self._files:
+        parts = UID.fullmatch(uid)
+        file = None if parts is None else self._mesh_file(parts[1], parts[2])
+        if file is None or not file.is_file():
             raise ObjectError(
                 "GraspXL objects",
                 f"there is no object {uid!r}",
                 expected="one of its uids(), such as 'objaverse/<32 hex digits>@large'",
                 action="List the uids and pick one.",
             )
-        return self._files[uid]
+        return file
+
+    def _mesh_file(self, name: str, size: str) -> Path:
+        return self._root / size / name / f"{name}.obj"
+
+    def _any_model(self, store: ObjaverseStore) -> bool:
+        """Whether the store holds the model of any object here."""
+        names = (uid.partition("/")[2] for uid in store.walk())
+        return any(self._mesh_file(name, size).is_file() for name in names for size in SIZES)
+
+    def _store_to_draw(self, file: Path) -> ObjaverseStore | None:
+        """The store whose model is drawn for this mesh; None: the mesh itself."""
+        store = self._store
+        if store is None or self._textures == "none":
+            return None
+        # Required: the store itself says what is not there, or only in part.
+        return store if self._textures == "required" or store.holds(file.stem) else None
+
+    def _note(self, file: Path) -> ObjaverseAnnotation | None:
+        return None if self._store is None else self._store.annotation(file.stem)
 
     def _drawn(self, read: ReadObject, file: Path) -> _Drawn:
-        if self._store is not None and self._store.holds(file.stem):
-            return self._textured(read, file, self._store)
-        return _untextured(read, file)
+        store = self._store_to_draw(file)
+        return (
+            _untextured(read, file, self._note(file)) if store is None else self._textured(read, file, store)
+        )
 
     def _textured(self, read: ReadObject, file: Path, store: ObjaverseStore) -> _Drawn:
         """The Objaverse model, moved to where the copy is."""
@@ -162,6 +207,8 @@ class GraspXLObjects:
         note = store.annotation(file.stem)
         return _Drawn(
             mesh=mesh,
+            source="objaverse",
+            appearance="original",
             name=(note and note.name) or file.stem,
             licence=note.licence if note else UNKNOWN_LICENCE,
             author=(note and note.author) or "unknown",
@@ -171,14 +218,21 @@ class GraspXLObjects:
         )
 
 
-def _untextured(read: ReadObject, file: Path) -> _Drawn:
+def _bare_licence(note: ObjaverseAnnotation | None) -> str:
+    """Of GraspXL's mesh: a work derived from the annotated model."""
+    return LICENCE if note is None else joined_licences(LICENCE, note.licence)
+
+
+def _untextured(read: ReadObject, file: Path, note: ObjaverseAnnotation | None) -> _Drawn:
     bare = outward_mesh(read.mesh)
     return _Drawn(
         mesh=with_plain_look(bare, file.stem),
-        name=file.stem,
-        licence=LICENCE,
-        author=AUTHORS,
-        url=URL,
+        source="graspxl",
+        appearance="generated",
+        name=(note and note.name) or file.stem,
+        licence=_bare_licence(note),
+        author=AUTHORS if note is None else f"{note.author or 'unknown'}; mesh: {AUTHORS}",
+        url=(note and note.url) or URL,
         texture_source=bare,
         registration=None,
     )
@@ -209,20 +263,9 @@ def _opened_root(root: Path | None) -> Path:
     )
 
 
-def _mesh_files(root: Path) -> dict[str, Path]:
-    files = {}
-    for size in SIZES:
-        if not (root / size).is_dir():
-            continue
-        for name in sorted(entry.name for entry in os.scandir(root / size) if entry.is_dir()):
-            file = root / size / name / f"{name}.obj"
-            if file.is_file():
-                files[f"objaverse/{name}@{size}"] = file
-    if not files:
-        raise ObjectError(
-            root,
-            "holds no <id>/<id>.obj",
-            expected="object_dataset/{small,medium,large}/<id>/<id>.obj",
-            action="Point at object_dataset; the recorded motions are other archives.",
-        )
-    return files
+def _mesh_names(root: Path, size: str) -> Iterator[str]:
+    """Ids of the meshes of one size, in the order of the disk."""
+    if (root / size).is_dir():
+        for entry in os.scandir(root / size):
+            if (root / size / entry.name / f"{entry.name}.obj").is_file():
+                yield entry.name

@@ -15,7 +15,7 @@ from datagen.objects.description import ObjectDescription
 from datagen.objects.errors import ObjectError
 from datagen.objects.gltf import read_gltf
 from datagen.objects.holdable import holdable_scale, scaled_mesh
-from datagen.objects.licences import UNKNOWN_LICENCE
+from datagen.objects.licences import UNKNOWN_LICENCE, joined_licences, licence_parts, spdx_of
 from datagen.objects.mesh import ObjectMesh
 from datagen.objects.orientation import outward_mesh
 from datagen.objects.preparation import PreparationConfig, cached_solid, solid_from_bytes
@@ -103,8 +103,8 @@ class StarterPack:
 class MeshFolder:
     """Every GLB, GLTF, OBJ, PLY and STL below a folder; uid "folder/<relative path>".
 
-    A file `objects.csv` in the folder may tell more: columns path, name, licence (SPDX id),
-    author, url. What it does not tell is "NOASSERTION".
+    A file `objects.csv` in the folder may tell more: columns path, name, licence (as `spdx_of`
+    takes it), author, url. What it does not tell is "NOASSERTION".
     """
 
     def __init__(
@@ -183,7 +183,24 @@ def _folder_notes(path: Path) -> dict[str, dict[str, str]]:
             expected="columns path, name, licence, author, url",
             action="Add the header line.",
         )
-    return {row["path"]: row for row in rows}
+    return {
+        row["path"]: {**row, "licence": _licence_of_row(path, number, row)}
+        for number, row in enumerate(rows, start=2)  # the header is row 1
+    }
+
+
+def _licence_of_row(path: Path, number: int, row: dict[str, str]) -> str:
+    """SPDX id (or several joined by AND); empty where the row does not tell."""
+    written = (row.get("licence") or "").strip()
+    try:
+        return joined_licences(*map(spdx_of, licence_parts(written))) if written else ""
+    except ObjectError as error:
+        raise ObjectError(
+            path,
+            f"row {number} ({row['path']}): the licence {written!r} is not known",
+            expected=error.expected,
+            action=error.action,
+        ) from error
 
 
 # Furniture is beyond a hand even as a miniature; and these are fixtures, not things one picks up.

@@ -4,9 +4,10 @@ import difflib
 
 from datagen.objects.errors import ObjectError
 
-__all__ = ["UNKNOWN_LICENCE", "licence_of_sketchfab", "spdx_of"]
+__all__ = ["UNKNOWN_LICENCE", "joined_licences", "licence_of_sketchfab", "licence_parts", "spdx_of"]
 
 UNKNOWN_LICENCE = "NOASSERTION"
+AND = " AND "  # of SPDX expressions: all of them apply
 
 # Sketchfab's slugs, as in the "license" of Objaverse's metadata. Its CC licences are version 4.0.
 SKETCHFAB_LICENCES = {
@@ -42,6 +43,16 @@ KNOWN_SPDX = (
     "PDDL-1.0",
     UNKNOWN_LICENCE,
 )
+
+
+def joined_licences(*licences: str) -> str:
+    """The SPDX expression for work under all of them, each once: "CC-BY-NC-4.0 AND CC-BY-4.0"."""
+    return AND.join(dict.fromkeys(licences))
+
+
+def licence_parts(expression: str) -> tuple[str, ...]:
+    """The licences of an expression that `joined_licences` gave; all must be allowed."""
+    return tuple(expression.split(AND))
 
 
 def licence_of_sketchfab(slug: str | None) -> str:

@@ -11,7 +11,9 @@ Source: github.com/allenai/objaverse-xl, objaverse/__init__.py. All but the mode
 import gzip
 import json
 import os
+import sys
 import zlib
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,9 @@ class ObjaverseStore:
     Sizes in Objaverse mean nothing. Each model is scaled until its bbox is as large as one hand
     holds (`fitted_scale`: smallest side up to 7.5 cm, as in GraspXL's "large" set);
     `catalogue_scale` records the factor.
+
+    The folders are listed only when that is needed: by `uids`, and for a model that is not where
+    object-paths.json.gz says.
     """
 
     def __init__(
@@ -50,9 +55,17 @@ class ObjaverseStore:
         self._root, self._origin = _opened_root(root)
         self._reading, self._preparation = reading, preparation
         self._cache_dir = cache_dir.expanduser()
-        self._folders = _models_on_disk(self._root, self._origin)
-        self._records: dict[str, dict[str, Any]] = {}  # by folder, read when first asked for
-        self._paths: dict[str, str] | None = None
+        if next(_walk(self._root), None) is None:
+            raise ObjectError(
+                self._root / "glbs",
+                f"holds no models (chosen by {self._origin})",
+                expected="000-xxx/<uid>.glb",
+                action=f"{DOWNLOAD}.",
+            )
+        self._listing: dict[str, str] | None = None  # folder by uid, of the models on disk
+        # By folder and uid, read when first asked for; the error where a record is malformed.
+        self._notes: dict[str, dict[str, ObjaverseAnnotation | ObjectError]] = {}
+        self._paths: dict[str, str] | None = None  # folder by uid, on disk or not
         self._categories: dict[str, str] | None = None
 
     @property
@@ -62,27 +75,33 @@ class ObjaverseStore:
 
     def uids(self) -> tuple[str, ...]:
         """ "objaverse/<uid>" of every model on disk, sorted."""
-        return tuple(f"objaverse/{uid}" for uid in self._folders)
+        return tuple(f"objaverse/{uid}" for uid in self._listed())
+
+    def walk(self) -> Iterator[str]:
+        """The same uids in the order of the disk, each found when it is asked for."""
+        return (f"objaverse/{uid}" for uid, _ in _walk(self._root))
 
     def holds(self, uid: str) -> bool:
         """Whether the model is on disk completely."""
-        return _plain(uid) in self._folders
+        return self._folder_on_disk(_plain(uid)) is not None
 
     def glb_path(self, uid: str) -> Path:
         """The model's file. ObjectError where it is absent or only partly downloaded."""
         plain = _plain(uid)
-        if plain in self._folders:
-            return self._root / "glbs" / self._folders[plain] / f"{plain}.glb"
-        if any((self._root / "glbs").glob(f"*/{plain}.glb.tmp")):
+        found = self._folder_on_disk(plain)
+        if found is not None:
+            return self._root / "glbs" / found / f"{plain}.glb"
+        if any((folder / f"{plain}.glb.tmp").is_file() for folder in (self._root / "glbs").iterdir()):
             raise ObjectError(
                 self._root,
                 f"object {uid!r} is only partly downloaded ({plain}.glb.tmp)",
                 expected=f"{plain}.glb",
                 action=f"{DOWNLOAD} again.",
             )
+        known = ": it is not downloaded" if self._folder_of_path(plain) else ""
         raise ObjectError(
             self._root,
-            f"has no object {uid!r} (folder chosen by {self._origin})",
+            f"has no object {uid!r}{known} (folder chosen by {self._origin})",
             expected="one of its uids()",
             action=f"{DOWNLOAD}, or pick another uid.",
         )
@@ -125,28 +144,51 @@ class ObjaverseStore:
     def annotation(self, uid: str) -> ObjaverseAnnotation | None:
         """The metadata of one model, on disk or not; None where they are not on disk.
 
-        Files are read once per instance. ObjectError where one is damaged.
+        Files are read once per instance. ObjectError where one is damaged, or this model's record.
         """
         plain = _plain(uid)
-        folder = self._folders.get(plain) or self._folder_of_path(plain)
+        folder = self._folder_of_path(plain) or self._folder_on_disk(plain)
         if folder is None:
             return None
-        if folder not in self._records:
-            self._records[folder] = _gzipped_json(self._root / "metadata" / f"{folder}.json.gz")
-        record = self._records[folder].get(plain)
-        return None if record is None else annotation_of_record(record, self._category(plain))
+        if folder not in self._notes:
+            self._notes[folder] = self._notes_of(folder)
+        note = self._notes[folder].get(plain)
+        if isinstance(note, ObjectError):
+            raise note.with_traceback(None)
+        return note
+
+    def _notes_of(self, folder: str) -> dict[str, ObjaverseAnnotation | ObjectError]:
+        """Of every record of one folder: a record itself is ten times as large as its annotation."""
+        path = self._root / "metadata" / f"{folder}.json.gz"
+        if self._categories is None:
+            self._categories = _categories(self._root / "lvis-annotations.json.gz")
+        notes: dict[str, ObjaverseAnnotation | ObjectError] = {}
+        for uid, record in _gzipped_json(path).items():
+            if record is None:
+                continue
+            try:
+                notes[uid] = annotation_of_record(record, self._categories.get(uid), source=path, uid=uid)
+            except ObjectError as error:
+                notes[uid] = error.with_traceback(None)  # whose frames would keep the records
+        return notes
+
+    def _listed(self) -> dict[str, str]:
+        if self._listing is None:
+            self._listing = dict(sorted(_walk(self._root)))
+        return self._listing
+
+    def _folder_on_disk(self, plain: str) -> str | None:
+        """The folder that holds the whole model."""
+        if self._listing is None:
+            folder = self._folder_of_path(plain)
+            if folder is not None and (self._root / "glbs" / folder / f"{plain}.glb").is_file():
+                return folder
+        return self._listed().get(plain)
 
     def _folder_of_path(self, plain: str) -> str | None:
         if self._paths is None:
-            self._paths = _gzipped_json(self._root / "object-paths.json.gz")
-        path = self._paths.get(plain)
-        return None if path is None else Path(path).parent.name
-
-    def _category(self, plain: str) -> str | None:
-        if self._categories is None:
-            lvis = _gzipped_json(self._root / "lvis-annotations.json.gz")
-            self._categories = {uid: category for category, uids in lvis.items() for uid in uids}
-        return self._categories.get(plain)
+            self._paths = _folders_of_paths(self._root / "object-paths.json.gz")
+        return self._paths.get(plain)
 
 
 def _plain(uid: str) -> str:
@@ -184,23 +226,42 @@ def _opened_root(root: Path | None) -> tuple[Path, str]:
     )
 
 
-def _models_on_disk(root: Path, origin: str) -> dict[str, str]:
-    """Folder of every completely downloaded model, by uid, sorted."""
-    found = {
-        entry.name.removesuffix(".glb"): folder.name
-        for folder in os.scandir(root / "glbs")
-        if folder.is_dir()
-        for entry in os.scandir(folder)
-        if entry.name.endswith(".glb") and entry.is_file()
-    }
-    if not found:
-        raise ObjectError(
-            root / "glbs",
-            f"holds no models (chosen by {origin})",
-            expected="000-xxx/<uid>.glb",
-            action=f"{DOWNLOAD}.",
-        )
-    return dict(sorted(found.items()))
+def _walk(root: Path) -> Iterator[tuple[str, str]]:
+    """Uid and folder of every completely downloaded model, in the order of the disk."""
+    for folder in os.scandir(root / "glbs"):
+        if folder.is_dir():
+            for entry in os.scandir(folder):
+                if entry.name.endswith(".glb") and entry.is_file():
+                    yield entry.name.removesuffix(".glb"), folder.name
+
+
+def _folders_of_paths(path: Path) -> dict[str, str]:
+    """Folder of every model of object-paths.json.gz, by uid; one string for all models of a folder."""
+    found = {}
+    for uid, place in _gzipped_json(path).items():
+        if not isinstance(place, str):
+            raise _damaged(path, f"has {place!r:.60} for {uid}", "glbs/000-xxx/<uid>.glb")
+        found[uid] = sys.intern(place.rpartition("/")[0].rpartition("/")[2])
+    return found
+
+
+def _categories(path: Path) -> dict[str, str]:
+    """LVIS category by uid; empty where the file is absent."""
+    found: dict[str, str] = {}
+    for category, uids in _gzipped_json(path).items():
+        if not isinstance(uids, list) or not all(isinstance(uid, str) for uid in uids):
+            raise _damaged(path, f"has {uids!r:.60} for {category!r}", "a list of uids")
+        found |= dict.fromkeys(uids, category)
+    return found
+
+
+def _damaged(path: Path, problem: str, expected: str) -> ObjectError:
+    return ObjectError(
+        path,
+        problem,
+        expected=expected,
+        action="Delete the file and download it again with the Python package objaverse.",
+    )
 
 
 def _gzipped_json(path: Path) -> dict[str, Any]:
@@ -209,18 +270,9 @@ def _gzipped_json(path: Path) -> dict[str, Any]:
         return {}
     try:
         content = json.loads(gzip.decompress(path.read_bytes()))
-    except (OSError, EOFError, ValueError, zlib.error) as error:
-        raise ObjectError(
-            path,
-            f"cannot be unpacked ({type(error).__name__}: {error})",
-            expected="gzipped JSON, as Objaverse publishes it",
-            action="Delete the file and download it again with the Python package objaverse.",
-        ) from error
+    except (OSError, EOFError, ValueError, RecursionError, zlib.error) as error:
+        problem = f"cannot be unpacked ({type(error).__name__}: {error})"
+        raise _damaged(path, problem, "gzipped JSON, as Objaverse publishes it") from error
     if not isinstance(content, dict):
-        raise ObjectError(
-            path,
-            f"holds a {type(content).__name__}",
-            expected="a mapping, as Objaverse publishes it",
-            action="Delete the file and download it again with the Python package objaverse.",
-        )
+        raise _damaged(path, f"holds a {type(content).__name__}", "a mapping, as Objaverse publishes it")
     return content

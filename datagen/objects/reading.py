@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import trimesh
 from jaxtyping import Float
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 from trimesh.visual import ColorVisuals
 
 from datagen.objects.errors import ObjectError
@@ -244,7 +244,7 @@ def _refuse_bad_images(material: Material, source: Path, config: ReadingConfig) 
             width, height = opened.size
             if max(width, height) <= config.max_image_px:  # larger ones are not even unpacked
                 opened.load()
-        except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        except Exception as error:  # Pillow raises whatever its decoders raise
             raise ObjectError(
                 source,
                 f"an image of material {material.name!r} cannot be decoded ({error})",

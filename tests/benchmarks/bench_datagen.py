@@ -14,7 +14,7 @@ import yaml
 from datagen.annotate import MotionGeometry, annotate_frame
 from datagen.config import load_config
 from datagen.library import open_library
-from datagen.pipeline import plan_dataset
+from datagen.planning import plan_dataset
 from datagen.scene import Scene
 from datagen.scene_file import save_scene
 from datagen.timing import PhaseTimer

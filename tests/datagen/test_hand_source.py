@@ -1,6 +1,7 @@
 """The hand that a configuration names: open or licensed, by path or by environment, never silently another."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,10 +30,29 @@ def licensed(tmp_path_factory):
     return folder
 
 
-def test_auto_is_open_where_nothing_licensed_lies(tmp_path):
+def test_auto_is_open_where_no_place_is_named():
     assert resolved_hand(AUTO) == OPEN
-    empty = replace(AUTO, mano_dir=tmp_path, html_dir=tmp_path)
-    assert (resolved_hand(empty).model, resolved_hand(empty).skin) == ("open", "open")
+
+
+def test_a_named_place_without_the_files_is_an_error_not_the_open_hand(licensed, tmp_path, monkeypatch):
+    with pytest.raises(InputError, match=r"holds no MANO_RIGHT\.pkl, though hand\.mano_dir"):
+        resolved_hand(replace(AUTO, mano_dir=tmp_path))
+    monkeypatch.setenv("MANO_DIR", str(tmp_path / "none"))
+    with pytest.raises(InputError, match=r"none: holds no MANO_RIGHT\.pkl"):
+        resolved_hand(AUTO)
+    with pytest.raises(InputError, match=r"holds no TextureBasis/model_sr/model\.pkl"):
+        resolved_hand(replace(AUTO, mano_dir=licensed, html_dir=tmp_path))
+
+
+def test_places_may_be_the_file_itself_the_inner_folder_or_below_home(licensed, monkeypatch):
+    monkeypatch.setenv("HOME", str(licensed.parent))
+    for mano, html in (
+        (licensed / "MANO_RIGHT.pkl", licensed / "TextureBasis"),
+        (Path("~") / licensed.name, Path("~") / licensed.name),
+    ):
+        found = resolved_hand(replace(AUTO, mano_dir=mano, html_dir=html))
+        assert (found.model, found.skin) == ("mano", "html")
+        assert open_hand(found).skins.name == "html model_sr"
 
 
 def test_auto_finds_the_licensed_files_by_path_and_by_environment(licensed, monkeypatch):
@@ -48,6 +68,8 @@ def test_html_without_mano_is_never_chosen_and_never_accepted(licensed):
     assert resolved_hand(replace(AUTO, html_dir=licensed)).skin == "open"
     with pytest.raises(ValueError, match="laid out on MANO's triangles"):
         replace(OPEN, skin="html")
+    with pytest.raises(InputError, match=r"hand\.skin: is html, but there is no MANO"):
+        resolved_hand(replace(AUTO, skin="html", html_dir=licensed))
 
 
 def test_mano_with_html_wears_the_html_texture(licensed):

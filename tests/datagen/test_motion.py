@@ -25,6 +25,8 @@ def line(uid: str, *, side: str = "right", sequence_id: str = "") -> MotionPlan:
         object_uid=uid,
         sequence_id=sequence_id,
         hand_side=side,
+        licence="NOASSERTION",
+        appearance="original",
         split="train",
         n_cameras=1,
         n_frames=2,

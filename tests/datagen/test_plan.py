@@ -18,7 +18,10 @@ def plan_of(motions: int, per_shard: int, *, seed: int = 0, uids: list[str] = UI
     return make_plan(
         PlanConfig(motions=motions, motions_per_shard=per_shard),
         dataset_seed=seed,
-        candidates=[Candidate(object_uid=uid, sequence_id="") for uid in uids],
+        candidates=[
+            Candidate(object_uid=uid, sequence_id="", licence="CC0-1.0", appearance="original")
+            for uid in uids
+        ],
         left_probability=0.0,
         split_rule=RULE,
         n_cameras=4,

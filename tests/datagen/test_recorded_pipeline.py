@@ -1,5 +1,6 @@
 """Recorded motions with MANO, HTML skin and Objaverse textures through the whole generator, right and left."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -126,23 +127,71 @@ def test_a_left_hand_is_the_mirrored_motion_of_the_mirrored_object(right, inputs
 
 
 def test_without_mano_the_open_hand_stands_in_and_every_clip_says_so(inputs, tmp_path):
-    (clip,) = render(inputs, tmp_path, mano_dir=str(tmp_path)).clips()
+    (clip,) = render(inputs, tmp_path, mano_dir=None).clips()
     assert (clip.hand_model, clip.hand_stands_in_for, clip.skin_model) == ("openhand", "mano", "open")
 
 
-def test_mano_that_appears_after_planning_does_not_change_hands_within_a_dataset(inputs, tmp_path):
+def test_mano_that_appears_after_planning_does_not_change_hands_within_a_dataset(
+    inputs, tmp_path, monkeypatch
+):
     def change(config: dict[str, Any]) -> None:
         small(config)
-        config["hand"] |= {"model": "auto", "skin": "open", "mano_dir": str(tmp_path / "later")}
+        config["hand"] |= {"model": "auto", "skin": "open"}
 
-    (tmp_path / "later").mkdir()
+    monkeypatch.delenv("MANO_DIR", raising=False)
     path = write_config(inputs, change)
     plan = ["plan", "--config", str(path), "--out", str(tmp_path / "out")]
     assert CliRunner().invoke(main, plan).exit_code == 0
-    write_mano(tmp_path / "later")
+    monkeypatch.setenv("MANO_DIR", str(inputs / "hands"))
     result = CliRunner().invoke(main, plan)
     assert result.exit_code == 2
     assert "another configuration" in result.output
+
+
+def test_a_store_that_changes_after_planning_is_refused_not_drawn(inputs, tmp_path):
+    """A licence that the selection never allowed must not come in through the worker."""
+    shutil.copytree(inputs, tmp_path / "inputs")
+    own = tmp_path / "inputs"
+    path = write_config(own, lambda c: (small(c), c["objects"].update(textures="when_present")))
+    glbs, hidden = own / "store" / "glbs", own / "hidden"
+    metadata = own / "store" / "metadata"
+    shutil.move(glbs, hidden)
+    metadata.rename(own / "metadata")
+    plan = ["plan", "--config", str(path), "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(main, plan).exit_code == 0
+    shutil.move(hidden, glbs)
+    (own / "metadata").rename(metadata)
+    result = CliRunner().invoke(main, ["render", *plan[1:], "--shard", "0"])
+    assert result.exit_code == 2
+    assert "is drawn here as original under CC-BY-4.0; expected generated under CC-BY-NC-4.0" in result.output
+
+
+def test_a_takedown_after_planning_skips_what_waits_and_names_what_is_finished(inputs, tmp_path):
+    shutil.copytree(inputs, tmp_path / "inputs")
+    own = tmp_path / "inputs"
+    (own / "takedown.txt").write_text("")
+
+    def change(config: dict[str, Any]) -> None:
+        small(config)
+        config["selection"]["takedown"] = "takedown.txt"
+
+    path = write_config(own, change)
+    arguments = ["--config", str(path), "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(main, ["plan", *arguments]).exit_code == 0
+    (own / "takedown.txt").write_text(f"https://sketchfab.com/3d-models/bread-{BREAD.upper()}\n")
+    result = CliRunner().invoke(main, ["render", *arguments, "--shard", "0"])
+    assert result.exit_code == 0, result.output
+    (report,) = verify_dataset(tmp_path / "out")
+    assert report.skipped == (f"motion 0: on the takedown list as {BREAD}",)
+    finished = tmp_path / "finished"
+    (own / "takedown.txt").write_text("")
+    rendered(path, finished)
+    (own / "takedown.txt").write_text(BREAD)
+    result = CliRunner().invoke(
+        main, ["render", "--config", str(path), "--out", str(finished), "--shard", "0"]
+    )
+    assert result.exit_code == 2
+    assert "is finished and holds 1 motions of what the takedown list names" in result.output
 
 
 @needs_sample
@@ -158,3 +207,19 @@ def test_the_real_sample_renders_into_a_verified_shard(tmp_path):
     assert report.skipped == ()
     (clip,) = dataset.clips()
     assert (clip.hand_stands_in_for, clip.object_uid[:10]) == ("mano", "objaverse/")
+
+
+@needs_sample
+@pytest.mark.slow
+def test_all_twenty_objects_of_the_sample_render_into_one_verified_shard(tmp_path):
+    def change(config: dict[str, Any]) -> None:
+        small(config)
+        config["plan"] = {"motions": 20, "motions_per_shard": 20}
+        config["motions"]["graspxl_root"] = str(SAMPLE)
+        config["objects"]["textures"] = "none"
+
+    dataset = rendered(write_config(tmp_path, change), tmp_path / "out")
+    (report,) = verify_dataset(dataset.path)
+    assert report.ok, report.findings
+    assert len({clip.object_uid.partition("@")[0] for clip in dataset.clips()}) + len(report.skipped) == 20
+    assert len(report.skipped) <= 1, report.skipped

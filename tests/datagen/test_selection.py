@@ -3,6 +3,8 @@
 import gzip
 import json
 import shutil
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 
@@ -68,7 +70,12 @@ def test_everything_sound_is_kept_with_its_figures(own_inputs):
     ("change", "rule", "uid", "reason"),
     [
         (lambda c: c["objects"].update(exclude=[f"objaverse/{ROCK}@large"]), Rule.EXCLUDED, ROCK, "objects.exclude"),
-        (lambda c: c["selection"].update(licence_allow=["by"]), Rule.LICENCE, ROCK, "CC0-1.0; allowed: CC-BY-4.0"),
+        (
+            lambda c: c["selection"].update(licence_allow=["by", "by-nc"]),
+            Rule.LICENCE,
+            ROCK,
+            "CC0-1.0; allowed: CC-BY-4.0, CC-BY-NC-4.0",
+        ),
         (lambda c: c["selection"]["texture"].update(min_resolution_px=10_000), Rule.TEXTURE, None, "10000 wanted"),
         (lambda c: c["selection"]["texture"].update(min_color_detail=0.99), Rule.TEXTURE, None, "0.99 wanted"),
         (lambda c: c["selection"]["movement"].update(min_rise_m=0.3), Rule.MOVEMENT, None, "rises 0.200 m, 0.3 wanted"),
@@ -109,16 +116,87 @@ def test_annotations_remove_before_a_mesh_is_read(own_inputs, values, reason):
     ("line", "n_removed"),
     [
         (BREAD, 2),
+        (BREAD.upper(), 2),
+        (f"https://sketchfab.com/3d-models/a-loaf-of-bread-{BREAD}", 2),
         (f"objaverse/{BREAD}", 2),
         (f"objaverse/{BREAD}@large", 2),
+        (f"objaverse/{BREAD}@large-mirrored", 2),  # as a shard names the mirror image
         (f"mano_dataset_1/large/{BREAD}/mano_2", 1),
-        (f"objaverse/{BREAD}@small", 0),
     ],
 )
 def test_the_takedown_list_names_objects_sizes_or_single_motions(own_inputs, line, n_removed):
     (own_inputs / "takedown.txt").write_text(f"# asked by the author\n\n{line}  # 2026-11-22\n")
     selection = selected(own_inputs, lambda c: c["selection"].update(takedown="takedown.txt"))
     assert rules(selection).get(Rule.TAKEDOWN.value, 0) == n_removed
+    assert selection.unmatched == ()
+
+
+def test_takedown_entries_that_name_nothing_are_told(own_inputs):
+    (own_inputs / "takedown.txt").write_text(f"objaverse/{BREAD}@small\nstarter/mlik\n")
+    selection = selected(own_inputs, lambda c: c["selection"].update(takedown="takedown.txt"))
+    assert selection.unmatched == (f"objaverse/{BREAD}@small", "starter/mlik")
+    assert len(selection.kept) == 6
+
+
+def test_an_exclusion_that_names_nothing_is_an_error_with_a_suggestion(own_inputs):
+    wrong = f"objaverse/{BREAD}@larg"
+    with pytest.raises(InputError, match=rf"names {wrong}.*Did you mean 'objaverse/{BREAD}@large'"):
+        selected(own_inputs, lambda c: c["objects"].update(exclude=[wrong]))
+    whole = selected(own_inputs, lambda c: c["objects"].update(exclude=[f"objaverse/{BREAD}"]))
+    assert rules(whole)[Rule.EXCLUDED.value] == 2
+
+
+def test_the_licence_of_the_motions_must_be_allowed_too(own_inputs):
+    selection = selected(own_inputs, lambda c: c["selection"].update(licence_allow=["cc0", "by"]))
+    assert rules(selection) == {Rule.LICENCE.value: 6}
+    assert all("of the recorded motion: CC-BY-NC-4.0" in d.reason for d in selection.decisions)
+
+
+def test_another_licence_in_the_metadata_is_noticed(own_inputs):
+    assert len(selected(own_inputs).kept) == 6
+    annotate(own_inputs, BREAD, license="by-nc-nd")
+    assert rules(selected(own_inputs)) == {"": 4, Rule.LICENCE.value: 2}
+
+
+def test_a_bare_mesh_keeps_the_licence_of_the_model_it_derives_from(own_inputs):
+    annotate(own_inputs, BREAD, license="by-nc-nd")
+    selection = selected(own_inputs, lambda c: c["objects"].update(textures="none"))
+    removed = [d for d in selection.decisions if not d.kept]
+    assert {d.object_uid for d in removed} == {f"objaverse/{BREAD}@large"}
+    assert all("CC-BY-NC-4.0 AND CC-BY-NC-ND-4.0" in d.reason for d in removed)
+    assert {d.appearance for d in selection.kept} == {"generated"}
+
+
+def test_places_of_files_do_not_change_the_decision(own_inputs):
+    selected(own_inputs)
+    looked: list[int] = []
+    selected(
+        own_inputs,
+        lambda c: c["objects"].update(cache_dir=str(own_inputs / "elsewhere")),
+        report=lambda done, total: looked.append(done),
+    )
+    assert not looked
+
+
+def test_the_selection_of_a_plan_is_not_overwritten(own_inputs):
+    config = write_config(own_inputs)
+    arguments = ["--config", str(config), "--out", str(own_inputs / "out")]
+    assert CliRunner().invoke(main, ["plan", *arguments]).exit_code == 0
+    before = (own_inputs / "out" / SELECTION_FILE).read_bytes()
+    result = CliRunner().invoke(main, ["select", *arguments, "--license-allow", "by,by-nc"])
+    assert result.exit_code == 2
+    assert "belongs to the plan beside it" in result.output
+    assert (own_inputs / "out" / SELECTION_FILE).read_bytes() == before
+
+
+def test_plans_made_at_the_same_time_are_one_plan(own_inputs):
+    """As a job array does that starts on an empty folder."""
+    config, out = write_config(own_inputs), own_inputs / "out"
+    command = [sys.executable, "-m", "datagen", "plan", "--config", str(config), "--out", str(out)]
+    runs = [subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) for _ in range(3)]
+    errors = [run.communicate()[1] for run in runs]
+    assert [run.returncode for run in runs] == [0, 0, 0], errors
+    assert len(pq.read_table(out / SELECTION_FILE)) == 6
 
 
 def test_a_longer_takedown_list_takes_effect_at_once(own_inputs):
@@ -158,7 +236,7 @@ def test_a_sequence_without_its_object_is_removed_not_overlooked(own_inputs):
 
 
 def test_the_file_holds_every_decision_and_is_used_again(own_inputs):
-    selection = selected(own_inputs, lambda c: c["selection"].update(licence_allow=["by"]))
+    selection = selected(own_inputs, lambda c: c["selection"].update(licence_allow=["by", "by-nc"]))
     path = own_inputs / "out" / SELECTION_FILE
     rows = pq.read_table(path).to_pylist()
     assert [row["reason"] for row in rows] == [d.reason for d in selection.decisions]
@@ -166,7 +244,7 @@ def test_the_file_holds_every_decision_and_is_used_again(own_inputs):
     looked: list[int] = []
     again = selected(
         own_inputs,
-        lambda c: c["selection"].update(licence_allow=["by"]),
+        lambda c: c["selection"].update(licence_allow=["by", "by-nc"]),
         report=lambda done, total: looked.append(done),
     )
     np.testing.assert_equal([vars(d) for d in again.decisions], [vars(d) for d in selection.decisions])

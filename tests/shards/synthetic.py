@@ -104,6 +104,7 @@ def synthetic_object(number: int, *, mesh: bool = True) -> ObjectRow:
         sdf_values=np.linalg.norm(samples, axis=1) - 0.5,
         texture_resolution_px=512,
         color_detail=0.5,
+        appearance="original",
         registration_residual=float("nan"),
         watertight_source=True,
     )

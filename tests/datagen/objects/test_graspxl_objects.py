@@ -1,6 +1,7 @@
 """GraspXL's object_dataset, with and without the textured originals."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from datagen.objects.surface import sample_surface
 from tests.datagen.grasps.graspxl_sample import SAMPLE, needs_sample
 from tests.datagen.objects.official_files import (
     MODELS,
+    folder_of,
     objaverse_id,
     write_graspxl_objects,
     write_objaverse_store,
@@ -82,7 +84,7 @@ def test_untextured_object_stays_in_the_frame_of_the_poses(opened, root):
         np.sort(asset.mesh.verts_obj, axis=0), np.sort(np.unique(there, axis=0), axis=0), atol=1e-9
     )
     assert np.ptp(asset.mesh.verts_obj, axis=0).min() == pytest.approx(0.075, rel=1e-5)
-    assert (asset.licence, asset.source) == ("CC-BY-NC-4.0", "graspxl")
+    assert (asset.licence, asset.source, asset.appearance) == ("CC-BY-NC-4.0", "graspxl", "generated")
     assert asset.texture.texture_resolution_px == 0
     assert asset.registration is None
     assert asset.solid.parts == ()
@@ -103,14 +105,16 @@ def test_textured_original_is_drawn_in_place(opened, root, store_root):
     np.testing.assert_array_equal(asset.T_obj_from_file, plain.T_obj_from_file)
     assert asset.texture.texture_resolution_px > 100
     assert (asset.licence, asset.author, asset.name) == ("CC-BY-4.0", "Ann Modeller", "Bread")
+    assert (asset.source, asset.appearance) == ("objaverse", "original")
 
 
 def test_description_and_texture_agree_with_the_loaded_object(opened, root, store_root):
     uid = f"objaverse/{BREAD}@large"
-    for library in (opened(root), opened(root, store_root)):
-        asset = library.load(uid)
-        assert library.describe(uid).licence == asset.licence
-        assert (library.describe(uid).annotation is None) == (asset.registration is None)
+    for library in (opened(root), opened(root, store_root), opened(root, store_root, "none")):
+        asset, described = library.load(uid), library.describe(uid)
+        assert described.licence == asset.licence
+        assert described.appearance == asset.appearance
+        assert (described.annotation is None) == (library.describe(uid).licences == ("CC-BY-NC-4.0",))
         assert library.texture_quality(uid) == asset.texture
 
 
@@ -124,19 +128,87 @@ def test_mirrored_textured_object_keeps_its_registration_consistent(opened, root
     np.testing.assert_array_equal(twice, asset.registration.T_rescaled_from_original)
 
 
-def test_textures_none_leaves_the_store_alone(opened, root, store_root):
-    asset = opened(root, store_root, "none").load(f"objaverse/{BREAD}@small")
-    assert (asset.registration, asset.licence) == (None, "CC-BY-NC-4.0")
+def assert_derived(library: GraspXLObjects, uid: str) -> None:
+    asset, described = library.load(uid), library.describe(uid)
+    assert (asset.registration, asset.source, asset.appearance) == (None, "graspxl", "generated")
+    assert (asset.name, asset.licence) == ("Bread", "CC-BY-NC-4.0 AND CC-BY-4.0")
+    assert asset.author.startswith("Ann Modeller; mesh: Zhang, Christen")
+    assert asset.url == f"https://sketchfab.com/3d-models/{BREAD}"
+    assert described.licences == ("CC-BY-NC-4.0", "CC-BY-4.0")
+    assert (described.annotation.name, described.appearance) == ("Bread", "generated")
+
+
+def test_bare_mesh_derives_from_the_model(opened, root, store_root, tmp_path):
+    """With textures left alone, and where only the metadata are on disk."""
+    uid = f"objaverse/{BREAD}@small"
+    assert_derived(opened(root, store_root, "none"), uid)
+    bare = write_objaverse_store(tmp_path / "bare")
+    (bare / "glbs" / folder_of(0) / f"{BREAD}.glb").unlink()
+    assert_derived(opened(root, bare), uid)
+
+
+@pytest.mark.parametrize(
+    ("slug", "licence"),
+    [
+        ("by-nc", "CC-BY-NC-4.0"),
+        ("by-nd", "CC-BY-NC-4.0 AND CC-BY-ND-4.0"),
+        (None, "CC-BY-NC-4.0 AND NOASSERTION"),
+    ],
+)
+def test_licence_of_a_bare_mesh_names_each_part_once(opened, root, tmp_path, slug, licence):
+    store = write_objaverse_store(tmp_path / "s", licences=(slug,))
+    uid = f"objaverse/{BREAD}@small"
+    assert opened(root, store, "none").describe(uid).licence == licence
+    (store / "metadata" / f"{folder_of(0)}.json.gz").unlink()
+    assert opened(root, store, "none").describe(uid).licence == "CC-BY-NC-4.0"
 
 
 def test_textures_required(opened, root, tmp_path):
     with pytest.raises(ObjectError, match="there is no Objaverse store"):
         opened(root, None, "required")
     some = write_objaverse_store(tmp_path / "some", MODELS[:1])
-    assert opened(root, some, "required").uids() == (f"objaverse/{BREAD}@small", f"objaverse/{BREAD}@large")
+    library = opened(root, some, "required")
+    assert library.uids() == opened(root).uids()
+    assert library.load(f"objaverse/{BREAD}@large").registration is not None
+    absent = f"objaverse/{objaverse_id('starter/rock_a')}@large"
+    for ask in (library.describe, library.texture_quality, library.load):
+        with pytest.raises(ObjectError, match="has no object"):
+            ask(absent)
     other = write_objaverse_store(tmp_path / "other", ("starter/milk",))
     with pytest.raises(ObjectError, match="holds the textured model of none"):
         opened(root, other, "required")
+
+
+def test_required_model_that_is_not_downloaded_is_named(opened, root, tmp_path):
+    store = write_objaverse_store(tmp_path / "s")
+    glb = store / "glbs" / folder_of(0) / f"{BREAD}.glb"
+    part = glb.rename(glb.with_name(f"{BREAD}.glb.tmp"))
+    for problem in ("is only partly downloaded", "has no object .*: it is not downloaded"):
+        library = opened(root, store, "required")
+        for ask in (library.describe, library.texture_quality, library.load):
+            with pytest.raises(ObjectError, match=problem):
+                ask(f"objaverse/{BREAD}@large")
+        part.unlink(missing_ok=True)
+
+
+def test_one_object_is_found_without_listing_the_others(opened, root, store_root, monkeypatch):
+    library = opened(root, store_root, "required")
+    monkeypatch.setattr("os.scandir", lambda _: pytest.fail("a folder is listed"))
+    assert library.load(f"objaverse/{BREAD}@large").registration is not None
+    assert library.describe(f"objaverse/{BREAD}@small").licence == "CC-BY-4.0"
+
+
+def test_construction_looks_at_a_few_meshes_only(opened, root, tmp_path, monkeypatch):
+    for k in range(50):
+        path = tmp_path / "g" / "large" / f"{k:032x}" / f"{k:032x}.obj"
+        path.parent.mkdir(parents=True)
+        path.touch()
+    asked = []
+    is_file = Path.is_file
+    monkeypatch.setattr(Path, "is_file", lambda path: asked.append(path) or is_file(path))
+    library = opened(tmp_path / "g")
+    assert len(asked) < 5
+    assert len(library.uids()) == 50
 
 
 def test_model_of_another_object_is_refused(opened, root, tmp_path):
@@ -161,9 +233,12 @@ def test_wrong_places_are_named(opened, tmp_path, monkeypatch):
         opened(tmp_path)
 
 
-def test_unknown_uid_is_named(opened, root):
-    with pytest.raises(ObjectError, match="there is no object 'objaverse/x@large'"):
-        opened(root).load("objaverse/x@large")
+@pytest.mark.parametrize(
+    "uid", ["objaverse/x@large", "x", "objaverse/../large@large", f"objaverse/{BREAD}@huge"]
+)
+def test_unknown_uid_is_named(opened, root, uid):
+    with pytest.raises(ObjectError, match=f"there is no object '{uid}'"):
+        opened(root).load(uid)
 
 
 def test_solid_without_parts_keeps_its_bytes(box, plain_mesh, quick_preparation):

@@ -132,6 +132,40 @@ def test_folder_loads_notes_and_caches(tmp_path, quick_preparation):
     assert len(list(cache.iterdir())) == 1
 
 
+@pytest.fixture
+def noted_folder(tmp_path, quick_preparation):
+    """A folder with a.stl and b.stl, opened with the licence of b.stl."""
+
+    def make(licence: str) -> MeshFolder:
+        for name in ("a", "b"):
+            trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / f"{name}.stl")
+        (tmp_path / "objects.csv").write_text(f"path,licence\na.stl,mit\nb.stl,{licence}\n")
+        return MeshFolder(tmp_path, REFERENCE_READING, quick_preparation, tmp_path / "cache")
+
+    return make
+
+
+@pytest.mark.parametrize(
+    ("written", "spdx"),
+    [
+        ("cc0", "CC0-1.0"),
+        (" cc-by-4.0 ", "CC-BY-4.0"),
+        ("LicenseRef-Ours", "LicenseRef-Ours"),
+        ("by AND mit", "CC-BY-4.0 AND MIT"),
+        ("", "NOASSERTION"),
+        ("  ", "NOASSERTION"),
+    ],
+)
+def test_folder_licences_become_spdx_ids(noted_folder, written, spdx):
+    assert noted_folder(written).describe("folder/b.stl").licence == spdx
+
+
+def test_folder_licence_with_a_typo_is_named(noted_folder):
+    problem = r"objects\.csv: row 3 \(b\.stl\): the licence 'cc00' is not known.*mean 'cc0'"
+    with pytest.raises(ObjectError, match=problem):
+        noted_folder("cc00")
+
+
 def test_empty_folder_is_refused(tmp_path, quick_preparation):
     with pytest.raises(ObjectError, match="holds no meshes"):
         MeshFolder(tmp_path, REFERENCE_READING, quick_preparation, tmp_path)

@@ -2,8 +2,9 @@
 
 import pytest
 
+from datagen.objects.description import ObjectDescription
 from datagen.objects.errors import ObjectError
-from datagen.objects.licences import licence_of_sketchfab, spdx_of
+from datagen.objects.licences import joined_licences, licence_of_sketchfab, spdx_of
 
 
 @pytest.mark.parametrize(
@@ -50,3 +51,10 @@ def test_nonsense_gets_none():
 )
 def test_slugs_in_metadata(slug, spdx):
     assert licence_of_sketchfab(slug) == spdx
+
+
+def test_description_splits_what_was_joined():
+    joined = joined_licences("CC-BY-NC-4.0", "MIT", "CC-BY-NC-4.0")
+    assert joined == "CC-BY-NC-4.0 AND MIT"
+    assert ObjectDescription(licence=joined).licences == ("CC-BY-NC-4.0", "MIT")
+    assert ObjectDescription(licence="MIT").licences == ("MIT",)

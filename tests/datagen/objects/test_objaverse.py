@@ -1,5 +1,7 @@
 """A store as the package `objaverse` leaves it on disk."""
 
+import gc
+
 import numpy as np
 import pytest
 
@@ -72,7 +74,7 @@ def test_annotation_of_a_model_that_is_not_on_disk(opened, tmp_path):
     root = write_objaverse_store(tmp_path / "s")
     (root / "glbs" / "000-000" / f"{BREAD}.glb").unlink()
     assert opened(root).annotation(BREAD).name == "Bread"
-    with pytest.raises(ObjectError, match="has no object"):
+    with pytest.raises(ObjectError, match=r"has no object .*: it is not downloaded"):
         opened(root).load(f"objaverse/{BREAD}")
 
 
@@ -93,6 +95,84 @@ def test_damaged_metadata_are_named(opened, tmp_path, damage):
     with pytest.raises(ObjectError, match=r"000-000\.json\.gz: cannot be unpacked") as caught:
         opened(root).annotation(BREAD)
     assert "\n" not in str(caught.value)
+
+
+MALFORMED = {
+    "record": (lambda r: [1], r"is \[1\]"),
+    "user": (lambda r: {**r, "user": "ann"}, "has user = 'ann'"),
+    "user name": (lambda r: {**r, "user": {"displayName": 3}}, "has user.displayName = 3"),
+    "license": (lambda r: {**r, "license": {"slug": "by"}}, "has license = "),
+    "archives": (lambda r: {**r, "archives": [1]}, "has archives = "),
+    "glb": (lambda r: {**r, "archives": {"glb": []}}, "has archives.glb = "),
+    "faces": (lambda r: {**r, "faceCount": "12"}, "has faceCount = '12'"),
+    "truth": (lambda r: {**r, "faceCount": True}, "has faceCount = True"),
+    "age": (lambda r: {**r, "isAgeRestricted": "no"}, "has isAgeRestricted = 'no'"),
+}
+
+
+@pytest.mark.parametrize("case", MALFORMED)
+def test_malformed_record_is_named_and_spoils_no_other(opened, tmp_path, case):
+    spoil, problem = MALFORMED[case]
+    root = write_objaverse_store(tmp_path / "s", MODELS[:1])
+    other = {"uid": "other", "name": "Other"}
+    good = {"uid": BREAD, "user": {"username": "ann"}}
+    write_gz(root / "metadata" / "000-000.json.gz", {BREAD: spoil(good), "other": other})
+    write_gz(root / "object-paths.json.gz", {BREAD: "glbs/000-000/a.glb", "other": "glbs/000-000/b.glb"})
+    store = opened(root)
+    for ask in (store.annotation, store.describe, store.load, store.annotation):
+        with pytest.raises(
+            ObjectError, match=rf"000-000\.json\.gz: the record of {BREAD} {problem}"
+        ) as caught:
+            ask(f"objaverse/{BREAD}")
+        assert "\n" not in str(caught.value)
+    assert store.annotation("other").name == "Other"
+
+
+@pytest.mark.parametrize("content", [{BREAD: 1}, {BREAD: ["glbs"]}])
+def test_malformed_paths_are_named(opened, tmp_path, content):
+    root = write_objaverse_store(tmp_path / "s", MODELS[:1])
+    write_gz(root / "object-paths.json.gz", content)
+    with pytest.raises(ObjectError, match=rf"object-paths\.json\.gz: has .* for {BREAD}"):
+        opened(root).load(BREAD)
+
+
+@pytest.mark.parametrize("content", [{"bread": None}, {"bread": "abc"}, {"bread": [[1]]}])
+def test_malformed_categories_are_named(opened, tmp_path, content):
+    root = write_objaverse_store(tmp_path / "s", MODELS[:1])
+    write_gz(root / "lvis-annotations.json.gz", content)
+    with pytest.raises(ObjectError, match=r"lvis-annotations\.json\.gz: has .* for 'bread'"):
+        opened(root).annotation(BREAD)
+
+
+def test_model_is_found_by_its_path_without_listing(opened, root, monkeypatch):
+    store = opened(root)
+    with monkeypatch.context() as patch:
+        patch.setattr("os.scandir", lambda _: pytest.fail("a folder is listed"))
+        assert store.holds(BREAD)
+        assert store.glb_path(BREAD).is_file()
+        assert store.describe(BREAD).licence == "CC-BY-4.0"
+    assert sorted(store.walk()) == list(store.uids())
+
+
+def test_model_elsewhere_than_its_path_is_found_by_listing(opened, tmp_path):
+    root = write_objaverse_store(tmp_path / "s")
+    (root / "glbs" / "000-007").mkdir()
+    moved = root / "glbs" / "000-007" / f"{BREAD}.glb"
+    (root / "glbs" / "000-000" / f"{BREAD}.glb").rename(moved)
+    assert opened(root).glb_path(BREAD) == moved
+
+
+def test_records_are_not_kept(opened, tmp_path):
+    """They are large; malformed ones, whose errors are kept, are no exception."""
+    root = write_objaverse_store(tmp_path / "s", MODELS[:1])
+    marked = {BREAD: {"name": "Bread", "mark": ["a"]}, "bad": {"mark": ["b"], "user": 1}}
+    write_gz(root / "metadata" / "000-000.json.gz", marked)
+    store = opened(root)
+    assert store.annotation(BREAD).name == "Bread"
+    gc.collect()
+    found = [thing for thing in gc.get_objects() if type(thing) is dict and "mark" in thing]
+    ours = {id(record) for record in marked.values()}
+    assert {id(thing) for thing in found if thing["mark"] in (["a"], ["b"])} == ours
 
 
 def test_root_comes_from_the_argument_the_environment_or_the_default(opened, root, tmp_path, monkeypatch):
