@@ -20,6 +20,7 @@ VENV    := .venv
 PIP     := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 RUNTIME := $(VENV)/.runtime-installed
 DEV     := $(VENV)/.dev-installed
+TRAIN   := $(VENV)/.training-installed
 
 .PHONY: help setup render train test test-slow check bench clean
 
@@ -42,7 +43,12 @@ $(RUNTIME): $(VENV)/bin/python pyproject.toml requirements.lock
 
 $(DEV): $(RUNTIME)
 	@echo "installing the development tools"
-	@$(PIP) --editable '.[datagen,dev]'
+	@$(PIP) --editable '.[datagen,model,dev]'
+	@touch $@
+
+$(TRAIN): $(RUNTIME)
+	@echo "installing PyTorch and what training needs"
+	@$(PIP) --editable '.[datagen,model]'
 	@touch $@
 
 setup: $(RUNTIME) ## create .venv and install the generator
@@ -50,8 +56,9 @@ setup: $(RUNTIME) ## create .venv and install the generator
 render: $(RUNTIME) ## plan CONFIG into OUT if needed, then render shard SHARD
 	@$(VENV)/bin/datagen render --config $(CONFIG) --out $(OUT) --shard $(SHARD) $(ARGS)
 
-train: ## train on the shards in DATA
-	@echo "make train: the network is not part of this version yet (DATA=$(DATA) would be its input); see README.md, 'What is here'"; exit 2
+train: $(TRAIN) ## train configs/model/tiny.yaml on shard 0 of DATA, rendering it if absent
+	@test -f $(DATA)/shards/shard-00000/shard.json || $(MAKE) --no-print-directory render SHARD=0 OUT=$(DATA)
+	@$(VENV)/bin/forehoi train configs/model/tiny.yaml $(ARGS)
 
 test: $(DEV) ## run the tests, without those marked slow
 	@$(VENV)/bin/python -m pytest -q -m "not slow" $(ARGS)

@@ -1,0 +1,198 @@
+"""The open hand encoder: a small CNN, trained on our own shards to find the hand and its 21 joints.
+
+`forehoi train hand_encoder` makes its weights (`hand_training.py`); it sees the same crop as the image encoder.
+"""
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+from torch.nn import functional
+
+from model.encoders.token_grid import CellCentres, resampled_tokens, resized
+from model.errors import ModelError
+
+__all__ = [
+    "N_JOINTS",
+    "HandEncoder",
+    "HandNet",
+    "HandNetConfig",
+    "HandOutput",
+    "load_hand_net",
+    "save_hand_net",
+]
+
+N_JOINTS = 21
+_STRIDES = (2, 4, 8, 16)
+_WEIGHTS, _CONFIG = "hand_encoder.safetensors", "hand_encoder.json"
+_ACTION = "Make it with `forehoi train hand_encoder`, or give the folder of one that is made."
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandNetConfig:
+    """`image_size`: pixels at which it runs, a multiple of 16. `widths`: channels at strides 2, 4, 8 and 16,
+    `decoder`: channels of the stride-4 map that mask and joints are read from; all multiples of 8."""
+
+    image_size: int
+    widths: tuple[int, int, int, int]
+    decoder: int
+
+    def __post_init__(self) -> None:
+        if self.image_size < _STRIDES[-1] or self.image_size % _STRIDES[-1]:
+            raise self._error(f"image_size is {self.image_size}", "a positive multiple of 16")
+        if len(self.widths) != len(_STRIDES) or any(w < 8 or w % 8 for w in (*self.widths, self.decoder)):
+            problem = f"widths are {self.widths}, decoder is {self.decoder}"
+            raise self._error(problem, "four widths and a decoder, positive multiples of 8")
+
+    @staticmethod
+    def _error(problem: str, expected: str) -> ModelError:
+        return ModelError("hand encoder", problem, expected=expected, action="Correct the configuration.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class HandOutput:
+    """What is predicted, at stride 4; cell [r, c] is centred at ((c + 0.5), (r + 0.5)) cells."""
+
+    mask_logits: Float[Tensor, "view cell cell"]
+    """Hand and arm, as far as visible."""
+    joint_logits: Float[Tensor, "view 21 cell cell"]
+    """Where each joint is, hidden or not; a softmax over the cells makes a distribution of it."""
+    right_logit: Float[Tensor, "view"]
+
+
+class _Residual(nn.Module):
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.body = nn.Sequential(_convolution(width, width, 3), _convolution(width, width, 3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.body(x)
+
+
+def _convolution(channels: int, width: int, kernel: int, *, stride: int = 1) -> nn.Sequential:
+    # Group norm: a step must not depend on how a batch is spread over processes.
+    conv = nn.Conv2d(channels, width, kernel, stride=stride, padding=(kernel - 1) // 2, bias=False)
+    return nn.Sequential(conv, nn.GroupNorm(8, width), nn.SiLU())
+
+
+class HandNet(nn.Module):
+    """Four halvings, then back up to stride 4 with lateral connections."""
+
+    def __init__(self, config: HandNetConfig) -> None:
+        super().__init__()
+        self.config = config
+        w2, w4, w8, w16 = config.widths
+        # Kernels of 4 at stride 2 look exactly at their cells; those of 3 would look half a pixel aside.
+        self.to_2 = _convolution(3, w2, 4, stride=2)
+        self.to_4 = nn.Sequential(_convolution(w2, w4, 4, stride=2), _Residual(w4))
+        self.to_8 = nn.Sequential(_convolution(w4, w8, 4, stride=2), _Residual(w8))
+        self.to_16 = nn.Sequential(_convolution(w8, w16, 4, stride=2), _Residual(w16), _Residual(w16))
+        self.lateral_16, self.lateral_8, self.lateral_4 = (
+            nn.Conv2d(w, config.decoder, 1) for w in (w16, w8, w4)
+        )
+        self.up_8 = _convolution(config.decoder, config.decoder, 3)
+        self.up_4 = _convolution(config.decoder, config.decoder, 3)
+        self.maps = nn.Conv2d(config.decoder, 1 + N_JOINTS, 1)
+        self.side = nn.Linear(w16, 1)
+
+    @property
+    def channels(self) -> int:
+        """Width of a token of `features`."""
+        return self.config.decoder + self.config.widths[-1]
+
+    def forward(self, images: Float[Tensor, "view 3 size size"]) -> HandOutput:
+        """Predictions for sRGB pictures in 0..1 of any size."""
+        fine, coarse = self._decoded(images)
+        maps = self.maps(fine)
+        return HandOutput(
+            mask_logits=maps[:, 0], joint_logits=maps[:, 1:], right_logit=self.side(coarse.mean((2, 3)))[:, 0]
+        )
+
+    def features(
+        self, images: Float[Tensor, "view 3 size size"], grid: int
+    ) -> Float[Tensor, "view token channel"]:
+        """What the predictions are read from, as tokens: the stride-4 map (mask, joints) and the stride-16
+        map (side, context), each layer-normalised without parameters."""
+        levels = [resampled_tokens(m, CellCentres.aligned(m.shape[-1]), grid) for m in self._decoded(images)]
+        return torch.cat([functional.layer_norm(level, level.shape[-1:]) for level in levels], dim=-1)
+
+    def _decoded(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        pixels = (4 * resized(images, self.config.image_size) - 2).to(self.side.weight.dtype)
+        at_4 = self.to_4(self.to_2(pixels))
+        at_8 = self.to_8(at_4)
+        at_16 = self.to_16(at_8)
+        fine = self.up_8(self.lateral_8(at_8) + _doubled(self.lateral_16(at_16)))
+        return self.up_4(self.lateral_4(at_4) + _doubled(fine)), at_16
+
+
+def _doubled(features: Tensor) -> Tensor:
+    return functional.interpolate(features, scale_factor=2, mode="nearest")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class HandEncoder:
+    """A trained HandNet as frozen encoder."""
+
+    network: HandNet
+    grid: int
+
+    @property
+    def channels(self) -> int:
+        return self.network.channels
+
+    def to(self, device: torch.device | str, dtype: torch.dtype) -> "HandEncoder":
+        self.network.to(device, dtype)
+        return self
+
+    @torch.no_grad()
+    def __call__(
+        self, images: Float[Tensor, "batch view 3 size size"]
+    ) -> Float[Tensor, "batch view token channel"]:
+        tokens = self.network.features(images.flatten(0, 1), self.grid)
+        return tokens.unflatten(0, images.shape[:2]).to(images.dtype)
+
+
+def save_hand_net(network: HandNet, folder: Path, *, dtype: torch.dtype) -> None:
+    """Weights (as `dtype`) and configuration into `folder`; each file appears whole or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tensors = {
+        name: value.detach().cpu().to(dtype).contiguous() for name, value in network.state_dict().items()
+    }
+    weights, config = folder / f"{_WEIGHTS}.part", folder / f"{_CONFIG}.part"
+    save_file(tensors, weights)
+    config.write_text(json.dumps(asdict(network.config), indent=1) + "\n", encoding="utf-8")
+    os.replace(weights, folder / _WEIGHTS)
+    os.replace(config, folder / _CONFIG)
+
+
+def load_hand_net(folder: Path) -> HandNet:
+    """A frozen HandNet in float32 on the CPU. ModelError when it is missing, broken or of another layout."""
+    try:
+        stored = json.loads((folder / _CONFIG).read_text(encoding="utf-8"))
+        config = HandNetConfig(**{**stored, "widths": tuple(stored["widths"])})
+        tensors = load_file(folder / _WEIGHTS)
+    except FileNotFoundError as error:
+        missing = Path(error.filename or _WEIGHTS).name
+        raise _unusable(folder, f"there is no {missing}") from error
+    except ModelError:
+        raise
+    except (OSError, SafetensorError, ValueError, TypeError, KeyError) as error:
+        raise _unusable(
+            folder, f"the hand encoder cannot be read ({' '.join(str(error).split())[:160]})"
+        ) from error
+    network = HandNet(config)
+    try:
+        network.load_state_dict({name: value.float() for name, value in tensors.items()})
+    except RuntimeError as error:
+        raise _unusable(folder, f"the weights are of another layout than {_CONFIG} says") from error
+    return network.eval().requires_grad_(False)
+
+
+def _unusable(folder: Path, problem: str) -> ModelError:
+    return ModelError(folder, problem, expected=f"a folder with {_WEIGHTS} and {_CONFIG}", action=_ACTION)

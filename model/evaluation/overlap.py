@@ -1,0 +1,31 @@
+"""Overlap and distance of voxel shapes and masks, as they are printed while training."""
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import KDTree
+from torch import Tensor
+
+__all__ = ["intersection_over_union", "voxel_chamfer"]
+
+
+def intersection_over_union(
+    predicted: Bool[Tensor, "batch *shape"], truth: Bool[Tensor, "batch *shape"]
+) -> Float[Tensor, " batch"]:
+    """IoU of each pair, 0..1; 1 where both are empty."""
+    a, b = predicted.flatten(1), truth.flatten(1)
+    union = (a | b).sum(1)
+    overlap = (a & b).sum(1)
+    return torch.where(union > 0, overlap / union.clamp(min=1), torch.ones_like(overlap, dtype=torch.float32))
+
+
+def voxel_chamfer(predicted: Bool[Tensor, "i j k"], truth: Bool[Tensor, "i j k"]) -> float:
+    """Chamfer distance of occupied voxel centres, unit: the canonical cube's side; infinite when one is empty.
+
+    Mean of the two mean nearest distances, unsquared.
+    """
+    a, b = ((occupied.nonzero().double() + 0.5) / occupied.shape[0] for occupied in (predicted, truth))
+    if not len(a) or not len(b):
+        return float("inf")
+    to_b, to_a = KDTree(b.numpy()).query(a.numpy())[0], KDTree(a.numpy()).query(b.numpy())[0]
+    return float(0.5 * (np.mean(to_b) + np.mean(to_a)))

@@ -1,0 +1,48 @@
+"""What passes between the branches: the fusion weights w_n of Eq. 1 and the projected mask tokens."""
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from model.networks.transformer import layer_norm
+
+__all__ = ["MaskContext", "ViewFusion"]
+
+
+class ViewFusion(nn.Module):
+    """Fusion weights w_n = softmax over views of a learned score of each view's tokens.
+
+    Eq. 1 gives one weight per frame, without a block index, and does not say how it is computed. Here the
+    score is an MLP of the view's mean normalised token x_1^n. Its last layer starts at zero, so w_n = 1 / N at
+    the start; ReconViaGen's published fusion is this uniform one (FORMATS 4.6).
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.score = nn.Sequential(nn.Linear(channels, channels // 4), nn.SiLU(), nn.Linear(channels // 4, 1))
+        for parameter in self.score[-1].parameters():
+            nn.init.zeros_(parameter)
+
+    def forward(self, tokens: Float[Tensor, "batch view token channel"]) -> Float[Tensor, "batch view"]:
+        """Weights of a sample sum to one; float32."""
+        pooled = layer_norm(tokens).mean(2)
+        return self.score(pooled)[..., 0].float().softmax(dim=1)
+
+
+class MaskContext(nn.Module):
+    """Mask-branch tokens as the condition of geometry blocks: layer norm, then a projection shared by all blocks.
+
+    Published weights expect layer-normed image features of width `condition_channels`. Under LoRA their to_kv
+    is frozen; this projection is trained whole and carries the mask tokens into the space to_kv expects.
+    """
+
+    def __init__(self, channels: int, condition_channels: int) -> None:
+        super().__init__()
+        self.projection = nn.Linear(channels, condition_channels)
+        nn.init.xavier_uniform_(self.projection.weight)
+        nn.init.zeros_(self.projection.bias)
+
+    def forward(
+        self, tokens: Float[Tensor, "batch view token channel"]
+    ) -> Float[Tensor, "batch view token condition"]:
+        """One context per view; views stay apart."""
+        return self.projection(layer_norm(tokens))

@@ -1,0 +1,102 @@
+"""Mask branch: a diffusion transformer over the tokens of each view, pixel-aligned with its image features.
+
+New in the paper (section 3.2), so trained from scratch. All views share its weights, and nothing marks a
+view's place: permuting views permutes masks.
+"""
+
+from dataclasses import dataclass
+
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from model.errors import ModelError
+from model.flow import preconditioned_velocity
+from model.networks.embeddings import TimestepEmbedder, sincos_position_embedding
+from model.networks.patches import patchify, unpatchify
+from model.networks.transformer import ModulatedCrossBlock, initialise_transformer, layer_norm
+
+__all__ = ["MaskBranch", "MaskBranchConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MaskBranchConfig:
+    """Sizes: grid x grid tokens, each over patch x patch pixels of the mask; `blocks` is the paper's P."""
+
+    feature_channels: int
+    grid: int
+    patch: int
+    channels: int
+    blocks: int
+    heads: int
+    mlp_ratio: int
+
+    def __post_init__(self) -> None:
+        if self.channels % self.heads:
+            raise ModelError(
+                "mask branch",
+                f"{self.heads} heads do not divide {self.channels} channels",
+                expected="channels % heads == 0",
+                action="Change one of them.",
+            )
+
+    @property
+    def mask_resolution(self) -> int:
+        """Pixels per side of a mask."""
+        return self.grid * self.patch
+
+
+class MaskBranch(nn.Module):
+    """Embedding, blocks and head; `DualBranchFlow` runs the blocks, in step with the geometry branch."""
+
+    pos_emb: Tensor
+
+    def __init__(self, config: MaskBranchConfig, geometry_channels: int) -> None:
+        super().__init__()
+        self.config = config
+        self.t_embedder = TimestepEmbedder(config.channels)
+        # Computed, not learned, and in no published file: not saved.
+        pos_emb = sincos_position_embedding(config.grid, 2, config.channels)
+        self.register_buffer("pos_emb", pos_emb, persistent=False)
+        self.feature_layer = nn.Linear(config.feature_channels, config.channels)
+        self.input_layer = nn.Linear(config.patch**2, config.channels)
+        self.blocks = nn.ModuleList(
+            ModulatedCrossBlock(
+                channels=config.channels,
+                context_channels=geometry_channels,
+                heads=config.heads,
+                mlp_ratio=config.mlp_ratio,
+            )
+            for _ in range(config.blocks)
+        )
+        self.out_layer = nn.Linear(config.channels, config.patch**2)
+        initialise_transformer(self, t_embedder=self.t_embedder, out_layer=self.out_layer)
+
+    def embed(
+        self, masks_t: Float[Tensor, "batch view 1 m m"], features: Float[Tensor, "batch view token feature"]
+    ) -> Float[Tensor, "batch view token channel"]:
+        """Tokens x_1^n: projected features + embedded noisy mask + position; ModelError for other sizes."""
+        side, tokens = self.config.mask_resolution, self.config.grid**2
+        found = (tuple(masks_t.shape[-2:]), *features.shape[2:])
+        expected = ((side, side), tokens, self.config.feature_channels)
+        if found != expected:
+            raise ModelError(
+                "masks_t and features",
+                f"mask size, tokens, feature channels {found}",
+                expected=str(expected),
+                action="Match grid, patch and feature_channels of the mask branch to the encoder.",
+            )
+        patches = patchify(masks_t.flatten(0, 1), self.config.patch).unflatten(0, masks_t.shape[:2])
+        return self.feature_layer(features) + self.input_layer(patches) + self.pos_emb
+
+    def read_out(
+        self,
+        tokens: Float[Tensor, "batch view token channel"],
+        masks_t: Float[Tensor, "batch view 1 m m"],
+        t: Float[Tensor, " batch"],
+    ) -> Float[Tensor, "batch view 1 m m"]:
+        """Velocity of every mask from x_{P+1}. Clean masks are -1 or 1, so their root mean square is 1."""
+        patches = self.out_layer(layer_norm(tokens, eps=1e-5))
+        side = self.config.mask_resolution
+        output = unpatchify(patches.flatten(0, 1), self.config.patch, (side, side))
+        output = output.unflatten(0, tokens.shape[:2]).to(masks_t.dtype)
+        return preconditioned_velocity(masks_t, output, t, clean_std=1.0)

@@ -1,0 +1,180 @@
+"""Stage 1 as one module and its training: amodal masks and shape denoised together (paper, 3.1-3.3)."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from model.encoders.aggregator import FeatureAggregator
+from model.encoders.protocol import FeatureEncoder
+from model.evaluation.overlap import intersection_over_union, voxel_chamfer
+from model.flow import (
+    Guidance,
+    SamplerSettings,
+    TimeDistribution,
+    euler_sample,
+    guided,
+    interpolate,
+    joint_cfm_loss,
+    noise_like,
+    times_from_uniform,
+    velocity_target,
+)
+from model.sample import Batch
+from model.sparse_structure.dual_branch import DualBranchFlow
+from model.sparse_structure.prediction import Prediction
+from model.sparse_structure.stage_one_pictures import prediction_rows
+from model.sparse_structure.vae import StructureVae, occupancy_from_logits
+from model.training.draws import normal_like, uniform
+from model.training.task import Evaluation, Losses
+
+__all__ = ["StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageOneConfig:
+    """What is learned and how it is sampled."""
+
+    beta: float  # weight of the 3D loss (Eq. 2)
+    drop_condition: float  # share of samples without condition, for guidance (paper: 0.1)
+    time: TimeDistribution
+    sampler: SamplerSettings
+    guidance: Guidance
+    latent_scale: float  # latents are divided by it: unit variance; TRELLIS: 1
+
+
+class StageOne(nn.Module):
+    """The trained parts: feature aggregator and dual-branch flow."""
+
+    def __init__(self, aggregator: FeatureAggregator, flow: DualBranchFlow) -> None:
+        super().__init__()
+        self.aggregator = aggregator
+        self.flow = flow
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StageOneTask:
+    """Trains a StageOne on frozen encoders and VAE; a `Task` of model/training/task.py."""
+
+    network: StageOne
+    image_encoder: FeatureEncoder
+    hand_encoder: FeatureEncoder
+    vae: StructureVae  # frozen
+    config: StageOneConfig
+
+    @property
+    def module(self) -> nn.Module:
+        return self.network
+
+    def features(
+        self, images: Float[Tensor, "batch view 3 size size"]
+    ) -> Float[Tensor, "batch view token channel"]:
+        """Image and hand features, aggregated (section 3.1)."""
+        return self.network.aggregator(self.image_encoder(images), self.hand_encoder(images))
+
+    def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
+        """Eq. 2: one t for both branches of a sample, condition dropped at random."""
+        masks = mask_targets(batch.object_amodal, self.network.flow.config.masks.mask_resolution)
+        latent = self.clean_latent(batch.occupancy)
+        device = latent.device
+        t = times_from_uniform(self.config.time, uniform(generators, device))
+        dropped = uniform(generators, device) < self.config.drop_condition
+        noise_latent, noise_masks = normal_like(latent, generators), normal_like(masks, generators)
+        features = self.features(batch.images)
+        features = torch.where(dropped[:, None, None, None], torch.zeros_like(features), features)
+        velocity = self.network.flow(
+            interpolate(latent, noise_latent, t), interpolate(masks, noise_masks, t), t, features
+        )
+        losses = joint_cfm_loss(
+            predicted_masks=velocity.masks,
+            target_masks=velocity_target(masks, noise_masks),
+            predicted_geometry=velocity.geometry,
+            target_geometry=velocity_target(latent, noise_latent),
+            beta=self.config.beta,
+        )
+        parts = {"masks": losses.masks.mean(), "geometry": losses.geometry.mean()}
+        return Losses(total=losses.total, parts=parts)
+
+    @torch.no_grad()
+    def clean_latent(self, occupancy: Bool[Tensor, "batch 64 64 64"]) -> Float[Tensor, "batch channel i j k"]:
+        """Mean latent of a shape, scaled."""
+        return self.vae.encoder(occupancy).mean / self.config.latent_scale
+
+    @torch.no_grad()
+    def predict(
+        self, images: Float[Tensor, "batch view 3 size size"], generator: torch.Generator
+    ) -> Prediction:
+        """Denoise masks and shape together, with guidance on the shape alone by the default config."""
+        features = self.features(images)
+        flow = self.network.flow
+        resolution = flow.config.masks.mask_resolution
+        empty = {
+            "geometry": features.new_zeros(len(images), *flow.config.geometry.latent_shape),
+            "masks": features.new_zeros(*images.shape[:2], 1, resolution, resolution),
+        }
+
+        def velocity_with(condition: Tensor) -> "_Velocity":
+            return _Velocity(flow, condition)
+
+        velocity = guided(
+            velocity_with(features),
+            velocity_with(flow.unconditional_features(features)),
+            self.config.guidance,
+        )
+        noise = noise_like({k: v.cpu() for k, v in empty.items()}, generator)
+        clean = euler_sample(
+            velocity, {k: v.to(features.device) for k, v in noise.items()}, self.config.sampler
+        )
+        logits = self.vae.decoder(clean["geometry"] * self.config.latent_scale)
+        return Prediction(occupancy=occupancy_from_logits(logits), masks=clean["masks"][:, :, 0])
+
+    @torch.no_grad()
+    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
+        """voxel_iou, chamfer (share of the cube's side), mask_iou against the amodal truth; fixed noise."""
+        figures: dict[str, list[float]] = {"voxel_iou": [], "chamfer": [], "mask_iou": [], "visible_iou": []}
+        pictures: dict[str, np.ndarray] = {}
+        generator = torch.Generator().manual_seed(0)
+        for batch in batches:
+            found = self.predict(batch.images, generator)
+            amodal = batch.object_amodal.flatten(0, 1)
+            masks = _full_size(found.masks, amodal.shape[-1]).flatten(0, 1) > 0
+            figures["voxel_iou"] += intersection_over_union(found.occupancy, batch.occupancy).tolist()
+            figures["mask_iou"] += intersection_over_union(masks, amodal).tolist()
+            figures["visible_iou"] += intersection_over_union(
+                batch.object_visible.flatten(0, 1), amodal
+            ).tolist()
+            figures["chamfer"] += [
+                voxel_chamfer(a.cpu(), b.cpu()) for a, b in zip(found.occupancy, batch.occupancy)
+            ]
+            if not pictures:
+                pictures = {"prediction": prediction_rows(batch, found)}
+        means = {name: sum(values) / max(len(values), 1) for name, values in figures.items()}
+        return Evaluation(figures=means, pictures=pictures)
+
+
+@dataclass(frozen=True, eq=False)
+class _Velocity:
+    """The flow as the sampler calls it."""
+
+    flow: DualBranchFlow
+    features: Tensor
+
+    def __call__(self, state: dict[str, Tensor], t: Tensor) -> dict[str, Tensor]:
+        velocity = self.flow(state["geometry"], state["masks"], t, self.features)
+        return {"geometry": velocity.geometry.float(), "masks": velocity.masks.float()}
+
+
+def mask_targets(
+    amodal: Bool[Tensor, "batch view size size"], resolution: int
+) -> Float[Tensor, "batch view 1 m m"]:
+    """Clean masks: share of each cell that is covered, from -1 (none) to +1 (all)."""
+    covered = functional.adaptive_avg_pool2d(amodal.float().flatten(0, 1)[:, None], resolution)
+    return (2.0 * covered - 1.0).unflatten(0, amodal.shape[:2])
+
+
+def _full_size(masks: Float[Tensor, "batch view m m"], size: int) -> Float[Tensor, "batch view size size"]:
+    return functional.interpolate(masks, size=(size, size), mode="bilinear", align_corners=False)

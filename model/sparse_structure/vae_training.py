@@ -1,0 +1,70 @@
+"""Training of the sparse-structure VAE on the occupancies of the shards."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import permutations
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor, nn
+
+from model.evaluation.overlap import intersection_over_union
+from model.sample import Batch
+from model.sparse_structure.vae import StructureVae, VaeConfig, occupancy_from_logits
+from model.training.draws import normal_like, uniform
+from model.training.task import Evaluation, Losses
+from model.training.voxel_picture import voxel_picture
+
+__all__ = ["VaeTask", "turned"]
+
+_AXES = tuple(permutations((1, 2, 3)))
+
+
+def turned(
+    occupancy: Bool[Tensor, "batch i j k"], generators: Sequence[torch.Generator]
+) -> Bool[Tensor, "batch i j k"]:
+    """Each shape in one of the 48 orientations of the cube, mirrored ones included: more shapes from few objects."""
+    choices = (48 * uniform(generators)).long().tolist()
+    shapes = []
+    for shape, choice in zip(occupancy, choices):
+        axes = [axis - 1 for axis in _AXES[choice % 6]]
+        flips = [axis for axis in range(3) if (choice // 6) >> axis & 1]
+        shapes.append(shape.permute(axes).flip(flips))
+    return torch.stack(shapes)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VaeTask:
+    """Trains a StructureVae; a `Task` of model/training/task.py."""
+
+    network: StructureVae
+    config: VaeConfig
+
+    @property
+    def module(self) -> nn.Module:
+        return self.network
+
+    def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
+        """Dice and KL of shapes in random orientations (FORMATS 4.1)."""
+        occupancy = turned(batch.occupancy, generators)
+        shape = self.config.latent_shape(occupancy.shape[-1])
+        noise = normal_like(torch.zeros(len(occupancy), *shape, device=occupancy.device), generators)
+        losses = self.network(occupancy, noise)
+        return Losses(total=losses.total, parts={"dice": losses.dice.mean(), "kl": losses.kl.mean()})
+
+    @torch.no_grad()
+    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
+        """voxel_iou of shapes through encoder and decoder; pictures: truth beside reconstruction."""
+        scores: list[Tensor] = []
+        pictures: dict[str, np.ndarray] = {}
+        for batch in batches:
+            decoded = occupancy_from_logits(self.network.decoder(self.network.encoder(batch.occupancy).mean))
+            scores.append(intersection_over_union(decoded, batch.occupancy))
+            if not pictures:
+                rows = [
+                    np.concatenate([voxel_picture(truth), voxel_picture(found)], axis=1)
+                    for truth, found in zip(batch.occupancy.cpu(), decoded.cpu())
+                ]
+                pictures = {"truth_and_reconstruction": np.concatenate(rows[:4], axis=0)}
+        return Evaluation(figures={"voxel_iou": float(torch.cat(scores).mean())}, pictures=pictures)

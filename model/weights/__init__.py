@@ -1,0 +1,1 @@
+"""Published checkpoints, mapped onto the modules of this package."""

@@ -1,0 +1,56 @@
+"""A lopsided object of few voxels, and its exact picture: for tests that render again after a crop."""
+
+import cv2
+import numpy as np
+
+from model.sample import OCCUPANCY_VOXELS
+from shards.geometry import project_points, transform_points
+
+_CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
+
+
+def lopsided_occupancy() -> np.ndarray:
+    """Like no mirror image and no rotation of itself."""
+    occupancy = np.zeros((OCCUPANCY_VOXELS,) * 3, bool)
+    occupancy[4:60, 24:36, 26:38] = True
+    occupancy[4:16, 24:60, 26:38] = True
+    occupancy[48:60, 24:36, 26:58] = True
+    occupancy[26:36, 8:24, 28:36] = True
+    return occupancy
+
+
+def voxel_centers_canonical(occupancy: np.ndarray) -> np.ndarray:
+    """Centres of the occupied voxels in the unit cube."""
+    return (np.argwhere(occupancy) + 0.5) / OCCUPANCY_VOXELS - 0.5
+
+
+def render_mask(
+    occupancy: np.ndarray, T_cam_from_canonical: np.ndarray, K: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """Silhouette (bool): pixels whose centre is covered by an occupied voxel."""
+    fine = 8  # OpenCV also fills the pixels that an outline touches, so draw finely and take the centres
+    K_fine = np.diag([fine, fine, 1.0]) @ K
+    mask = np.zeros((size[1] * fine, size[0] * fine), np.uint8)
+    for low, high in _bars(occupancy):
+        corners = (low + _CORNERS * (high - low)) / OCCUPANCY_VOXELS - 0.5
+        pixels = project_points(transform_points(T_cam_from_canonical, corners), K_fine) - 0.5
+        cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
+    return mask[fine // 2 :: fine, fine // 2 :: fine].astype(bool)
+
+
+def _bars(occupancy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Boxes (low, high) that the occupancy is the union of, grown greedily."""
+    left, bars = occupancy.copy(), []
+    while left.any():
+        low = np.argwhere(left)[0]
+        high = low + 1
+        for axis in (0, 1, 2):
+            while high[axis] < OCCUPANCY_VOXELS:
+                grown = high.copy()
+                grown[axis] += 1
+                if not occupancy[tuple(slice(a, b) for a, b in zip(low, grown))].all():
+                    break
+                high = grown
+        left[tuple(slice(a, b) for a, b in zip(low, high))] = False
+        bars.append((low, high))
+    return bars

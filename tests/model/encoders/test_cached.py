@@ -1,0 +1,58 @@
+"""The cache gives what the encoder gives, and asks it once."""
+
+from dataclasses import dataclass, field
+
+import torch
+
+from model.encoders.cached import CachedEncoder
+from model.encoders.protocol import FeatureEncoder
+
+
+@dataclass(frozen=True, kw_only=True)
+class Means:
+    """Mean colour of each quarter; counts the views it was asked for."""
+
+    grid: int = 2
+    channels: int = 3
+    asked: list[int] = field(default_factory=list)
+
+    def to(self, device: torch.device | str, dtype: torch.dtype) -> "Means":
+        return self
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        self.asked.append(images.shape[0] * images.shape[1])
+        pooled = torch.nn.functional.adaptive_avg_pool2d(images.flatten(0, 1), 2)
+        return pooled.flatten(2).transpose(1, 2).unflatten(0, images.shape[:2])
+
+
+def test_each_picture_is_computed_once() -> None:
+    inner = Means()
+    cached = CachedEncoder(encoder=inner, max_views=100)
+    assert isinstance(cached, FeatureEncoder)
+    images = torch.rand(2, 3, 3, 8, 8)
+    images[1, 2] = images[0, 0]
+    assert torch.equal(cached(images), inner(images))
+    assert torch.equal(cached(images.flip(0)), inner(images.flip(0)))
+    assert torch.equal(cached(images[:1, :1]), inner(images[:1, :1]))
+    assert inner.asked == [5, 6, 6, 1]  # of these only the 5 by the cache
+
+
+def test_other_pictures_other_features_and_no_more_than_allowed() -> None:
+    inner = Means()
+    cached = CachedEncoder(encoder=inner, max_views=2)
+    images = torch.rand(1, 3, 3, 8, 8)
+    first = cached(images)
+    changed = images.clone()
+    changed[0, 0, 0, 0, 0] += 0.5
+    assert not torch.equal(cached(changed)[0, 0], first[0, 0])
+    assert inner.asked == [3, 2]  # the changed one, and the third, which did not fit
+
+
+def test_moving_forgets() -> None:
+    inner = Means()
+    cached = CachedEncoder(encoder=inner, max_views=9)
+    images = torch.rand(1, 1, 3, 8, 8)
+    cached(images)
+    cached.to("cpu", torch.float32)(images)
+    assert inner.asked == [1, 1]
+    assert cached(images.bfloat16()).dtype == torch.bfloat16

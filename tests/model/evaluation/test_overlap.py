@@ -1,0 +1,27 @@
+"""Overlap and distance on shapes whose answer is known."""
+
+import pytest
+import torch
+
+from model.evaluation.overlap import intersection_over_union, voxel_chamfer
+
+
+def cube(low: int, high: int, size: int = 16) -> torch.Tensor:
+    shape = torch.zeros(size, size, size, dtype=torch.bool)
+    shape[low:high, low:high, low:high] = True
+    return shape
+
+
+def test_iou_of_shifted_equal_disjoint_and_empty_shapes():
+    a = torch.stack([cube(0, 4), cube(0, 4), cube(0, 4), torch.zeros(16, 16, 16, dtype=torch.bool)])
+    b = torch.stack([cube(0, 4), cube(2, 6), cube(8, 12), torch.zeros(16, 16, 16, dtype=torch.bool)])
+    expected = torch.tensor([1.0, 8 / (128 - 8), 0.0, 1.0])
+    torch.testing.assert_close(intersection_over_union(a, b), expected)
+
+
+def test_chamfer_of_single_voxels_is_their_distance_in_cube_sides():
+    a, b = (torch.zeros(16, 16, 16, dtype=torch.bool) for _ in range(2))
+    a[2, 3, 4] = b[2, 3, 12] = True
+    assert voxel_chamfer(a, b) == pytest.approx(0.5)
+    assert voxel_chamfer(a, a) == 0.0
+    assert voxel_chamfer(a, torch.zeros_like(a)) == float("inf")

@@ -1,0 +1,155 @@
+"""The stage-1 task on small sizes: losses reach every trained part, prediction is repeatable, targets are exact."""
+
+import pytest
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
+from model.flow import Guidance, SamplerSettings, UniformTime
+from model.sample import Batch
+from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
+from model.sparse_structure.geometry_branch import GeometryBranchConfig
+from model.sparse_structure.mask_branch import MaskBranchConfig
+from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask, mask_targets
+from model.sparse_structure.vae import StructureVae, VaeConfig
+from model.sparse_structure.vae_training import turned
+from model.training.draws import sample_generators
+
+
+class MeanColor:
+    """A frozen encoder: mean colour of each cell."""
+
+    def __init__(self, grid: int) -> None:
+        self.grid, self.channels = grid, 3
+
+    def to(self, device, dtype) -> "MeanColor":
+        return self
+
+    def __call__(
+        self, images: Float[Tensor, "batch view 3 size size"]
+    ) -> Float[Tensor, "batch view token channel"]:
+        cells = torch.nn.functional.adaptive_avg_pool2d(images.flatten(0, 1), self.grid)
+        return cells.flatten(2).transpose(1, 2).unflatten(0, images.shape[:2])
+
+
+@pytest.fixture
+def task() -> StageOneTask:
+    torch.manual_seed(0)
+    vae = VaeConfig(channels=(4, 4, 8, 8), latent_channels=4, residual_blocks=(1, 1, 1, 1), middle_blocks=1)
+    flow = DualBranchConfig(
+        geometry=GeometryBranchConfig(
+            latent_resolution=8,
+            latent_channels=4,
+            patch=2,
+            latent_rms=1.0,
+            channels=32,
+            condition_channels=32,
+            blocks=2,
+            heads=2,
+            mlp_ratio=2,
+        ),
+        masks=MaskBranchConfig(
+            feature_channels=16, grid=4, patch=4, channels=32, blocks=2, heads=2, mlp_ratio=2
+        ),
+        checkpoint_blocks=False,
+    )
+    aggregator = FeatureAggregator(
+        AggregatorConfig(
+            image_channels=3, image_grid=4, hand_channels=3, hand_grid=2, hand_width=8, hidden=16, channels=16
+        )
+    )
+    return StageOneTask(
+        network=StageOne(aggregator, DualBranchFlow(flow)),
+        image_encoder=MeanColor(4),
+        hand_encoder=MeanColor(2),
+        vae=StructureVae(vae).eval().requires_grad_(False),
+        config=StageOneConfig(
+            beta=1.0,
+            drop_condition=0.1,
+            time=UniformTime(),
+            sampler=SamplerSettings(steps=3, rescale_t=1.0),
+            guidance=Guidance(strength={"geometry": 1.0}, interval=(0.5, 1.0)),
+            latent_scale=1.0,
+        ),
+    )
+
+
+@pytest.fixture
+def batch() -> Batch:
+    generator = torch.Generator().manual_seed(1)
+    occupancy = torch.zeros(3, 64, 64, 64, dtype=torch.bool)
+    occupancy[:, 20:40, 20:50, 25:35] = True
+    amodal = torch.zeros(3, 2, 32, 32, dtype=torch.bool)
+    amodal[..., 8:24, 10:20] = True
+    visible = amodal.clone()
+    visible[..., 16:24, :] = False
+    return Batch(
+        images=torch.rand(3, 2, 3, 32, 32, generator=generator),
+        object_amodal=amodal,
+        object_visible=visible,
+        hand_visible=amodal & ~visible,
+        K=torch.eye(3).expand(3, 2, 3, 3).clone(),
+        T_cam_from_canonical=torch.eye(4).expand(3, 2, 4, 4).clone(),
+        occupancy=occupancy,
+        joints_px=torch.zeros(3, 2, 21, 2),
+        is_right=torch.ones(3, dtype=torch.bool),
+        ids=("a:0:0", "b:0:1", "c:0:2"),
+    )
+
+
+def test_the_loss_trains_aggregator_and_both_branches_and_nothing_frozen(task, batch):
+    for parameter in task.module.parameters():  # away from zero-initialised projections
+        torch.nn.init.normal_(parameter, std=0.05)
+    losses = task.loss(batch, sample_generators(0, 0, range(3)))
+    losses.total.backward()
+    assert set(losses.parts) == {"masks", "geometry"}
+    without = [name for name, p in task.module.named_parameters() if p.grad is None or not p.grad.any()]
+    assert not without
+    assert all(p.grad is None for p in task.vae.parameters())
+
+
+def test_the_loss_of_a_sample_does_not_depend_on_its_neighbours(task, batch):
+    """As it must when ranks share a global batch."""
+    whole = task.loss(batch, sample_generators(0, 5, range(3))).total
+    alone = [task.loss(one(batch, place), sample_generators(0, 5, [place])).total for place in range(3)]
+    torch.testing.assert_close(torch.stack(alone).mean(), whole, rtol=1e-5, atol=1e-6)
+
+
+def one(batch: Batch, place: int) -> Batch:
+    fields = {name: value[place : place + 1] for name, value in vars(batch).items() if name != "ids"}
+    return Batch(**fields, ids=batch.ids[place : place + 1])
+
+
+def test_prediction_is_repeatable_and_has_the_sizes_of_its_inputs(task, batch):
+    a, b = (task.predict(batch.images, torch.Generator().manual_seed(3)) for _ in range(2))
+    assert a.occupancy.shape == (3, 64, 64, 64)
+    assert a.masks.shape == (3, 2, 16, 16)
+    assert torch.equal(a.masks, b.masks)
+    assert torch.equal(a.occupancy, b.occupancy)
+
+
+def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
+    evaluation = task.evaluate(task.module, [batch])
+    assert evaluation.figures["visible_iou"] == pytest.approx(0.5)
+    assert 0.0 <= evaluation.figures["mask_iou"] <= 1.0
+    assert evaluation.pictures["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
+
+
+def test_mask_targets_are_covered_shares(batch):
+    targets = mask_targets(batch.object_amodal, 16)
+    assert targets.shape == (3, 2, 1, 16, 16)
+    assert targets[0, 0, 0, 5, 6] == 1.0
+    assert targets[0, 0, 0, 0, 0] == -1.0
+    assert mask_targets(batch.object_amodal, 8)[0, 0, 0, 3, 2] == 0.0  # half of the cell's columns
+
+
+def test_turned_shapes_are_all_48_orientations_of_the_same_voxels():
+    shape = torch.zeros(1, 8, 8, 8, dtype=torch.bool)
+    shape[0, 0, 1, 3] = shape[0, 0, 1, 4] = shape[0, 2, 5, 6] = True
+    seen = {
+        tuple(turned(shape, [torch.Generator().manual_seed(seed)])[0].nonzero().flatten().tolist())
+        for seed in range(600)
+    }
+    assert len(seen) == 48
+    assert all(len(voxels) == 9 for voxels in seen)

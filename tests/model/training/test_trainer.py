@@ -1,0 +1,234 @@
+"""Training resumes exactly, is the same on any number of ranks, and stops with a reason."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from model.errors import ModelError
+from model.training.checkpoint import latest_checkpoint, load_average, read_state
+from model.training.config import TrainerConfig
+from model.training.trainer import NonFiniteLossError, StepReport, train
+from tests.model.training.toy import OPTIMIZER, ToySource, ToyTask, settings
+
+ROOT = Path(__file__).resolve().parents[3]
+TOY = Path(__file__).with_name("toy.py")
+
+
+def run(folder: Path, config: TrainerConfig, *, source: ToySource | None = None, sha: str = "toy", **options):
+    task = ToyTask()
+    source = source or ToySource(4)
+    state = train(
+        task,
+        source,
+        config,
+        OPTIMIZER,
+        folder=folder,
+        config_yaml="toy",
+        config_sha256=sha,
+        **options,
+    )
+    return task, state, source
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    path = latest_checkpoint(folder / "checkpoints")
+    assert path is not None
+    return {
+        f"{file.stem}/{name}": value
+        for file in sorted(path.glob("*.safetensors"))
+        for name, value in load_file(file).items()
+    }
+
+
+def assert_same_tensors(a: Path, b: Path, **tolerance: float) -> None:
+    left, right = tensors(a), tensors(b)
+    assert left.keys() == right.keys()
+    for name in left:
+        torch.testing.assert_close(left[name], right[name], **{"rtol": 0.0, "atol": 0.0, **tolerance})
+
+
+@pytest.mark.parametrize("steps", [(4, 10), (7, 10), (1, 10)])
+def test_k_steps_and_a_resume_equal_a_run_in_one_go_bit_for_bit(tmp_path, steps):
+    """Weights, averages, optimiser, buffers and the position in the data."""
+    first, last = steps
+    run(tmp_path / "whole", settings(last))
+    part = settings(last, checkpoint_every=1)
+
+    class StopError(Exception):
+        pass
+
+    def stop(report: StepReport) -> None:
+        if report.step == first + 1:
+            raise StopError
+
+    with pytest.raises(StopError):
+        run(tmp_path / "parts", part, report=stop)
+    _, state, source = run(tmp_path / "parts", part)
+    assert state.step == last
+    assert source.seen[0] == 4 * first  # not one sample twice
+    assert_same_tensors(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_a_finished_run_is_left_alone(tmp_path):
+    run(tmp_path, settings(5))
+    before = latest_checkpoint(tmp_path / "checkpoints").stat().st_mtime_ns
+    _, state, source = run(tmp_path, settings(5))
+    assert (state.step, source.seen) == (5, [])
+    assert latest_checkpoint(tmp_path / "checkpoints").stat().st_mtime_ns == before
+
+
+def test_the_loss_falls(tmp_path):
+    losses: list[float] = []
+    run(tmp_path, settings(60), report=lambda report: losses.append(report.losses["loss"]))
+    assert sum(losses[-10:]) < 0.2 * sum(losses[:10])
+
+
+def test_two_half_batches_accumulated_equal_one_batch(tmp_path):
+    """The noise differs (it belongs to the place in the batch), so only its size is compared."""
+    grads: list[float] = []
+    run(
+        tmp_path / "a",
+        settings(6, accumulate=2),
+        source=ToySource(2),
+        report=lambda r: grads.append(r.gradient_norm),
+    )
+    whole: list[float] = []
+    run(tmp_path / "b", settings(6), source=ToySource(4), report=lambda r: whole.append(r.gradient_norm))
+    assert grads == pytest.approx(whole, rel=0.5)
+    assert read_state(latest_checkpoint(tmp_path / "a" / "checkpoints")).samples_consumed == 12
+
+
+def torchrun(folder: Path, ranks: int, steps: int) -> None:
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={ranks}"]
+    command += [str(TOY), str(folder), str(steps), "4"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_two_processes_give_the_result_of_one_and_go_on_from_it(tmp_path):
+    """1 -> 2 -> 1 ranks; sums in another order may change last bits."""
+    run(tmp_path / "one", settings(10))
+    torchrun(tmp_path / "two", 2, 10)
+    assert_same_tensors(tmp_path / "one", tmp_path / "two", rtol=1e-4, atol=1e-6)
+    assert len(list((tmp_path / "two" / "checkpoints").iterdir())) == 2  # only one rank writes
+
+
+def test_sigterm_saves_and_the_next_run_goes_on(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(
+        [sys.executable, str(TOY), str(tmp_path / "killed"), "40", "4", "slow"],
+        cwd=ROOT,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    for line in process.stdout:
+        if line.strip() == "6":
+            break
+    process.send_signal(signal.SIGTERM)
+    _, errors = process.communicate(timeout=60)
+    assert "TrainingStopped" in errors
+    stopped = read_state(latest_checkpoint(tmp_path / "killed" / "checkpoints"))
+    assert 6 <= stopped.step < 12
+    run(tmp_path / "killed", settings(40))
+    run(tmp_path / "whole", settings(40))
+    assert_same_tensors(tmp_path / "whole", tmp_path / "killed")
+
+
+def test_nan_stops_with_the_samples_named_and_the_last_good_state_kept(tmp_path):
+    with pytest.raises(NonFiniteLossError, match=r"the loss is nan .*samples .*toy:2:29.*newest checkpoint"):
+        run(tmp_path, settings(20), source=ToySource(4, poison=29))
+    state = read_state(latest_checkpoint(tmp_path / "checkpoints"))
+    assert state.step == 4
+    assert all(torch.isfinite(value).all() for value in tensors(tmp_path).values())
+
+
+def test_validation_uses_the_averaged_weights_and_takes_them_back(tmp_path):
+    seen: list[dict[str, torch.Tensor]] = []
+    task = ToyTask()
+
+    def validate():
+        seen.append({name: p.detach().clone() for name, p in task.module.named_parameters()})
+        return task.evaluate(task.module, [next(ToySource(2).batches(0, 0)).batch])
+
+    train(
+        task,
+        ToySource(4),
+        settings(8, validate_every=8),
+        OPTIMIZER,
+        folder=tmp_path,
+        config_yaml="toy",
+        config_sha256="toy",
+        validate=validate,
+    )
+    saved = tensors(tmp_path)
+    for name, value in seen[0].items():
+        torch.testing.assert_close(value, saved[f"average/{name}"], rtol=0.0, atol=0.0)
+    for name, parameter in task.module.named_parameters():
+        torch.testing.assert_close(parameter.detach(), saved[f"weights/{name}"], rtol=0.0, atol=0.0)
+    other = ToyTask()
+    load_average(latest_checkpoint(tmp_path / "checkpoints"), other.module)
+    for name, parameter in other.module.named_parameters():
+        torch.testing.assert_close(parameter.detach(), saved[f"average/{name}"])
+
+
+def test_another_configuration_is_refused(tmp_path):
+    run(tmp_path, settings(4))
+    with pytest.raises(ModelError, match="was trained with another configuration"):
+        run(tmp_path, settings(8), sha="other")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda p: (p / "state.json").write_text("{"), "is no checkpoint"),
+        (lambda p: (p / "weights.safetensors").write_bytes(b"123"), r"weights\.safetensors: cannot be read"),
+        (
+            lambda p: (p / "state.json").write_text(
+                json.dumps(json.loads((p / "state.json").read_text()) | {"format_version": 9})
+            ),
+            "has checkpoint format 9",
+        ),
+    ],
+)
+def test_a_damaged_checkpoint_is_one_line(tmp_path, spoil, message):
+    run(tmp_path, settings(4))
+    spoil(latest_checkpoint(tmp_path / "checkpoints"))
+    with pytest.raises(ModelError, match=message) as error:
+        run(tmp_path, settings(8))
+    assert "\n" not in str(error.value)
+
+
+def test_a_half_written_checkpoint_does_not_count(tmp_path):
+    run(tmp_path, settings(8))
+    folder = tmp_path / "checkpoints"
+    (folder / ".step-00000099.partial").mkdir()
+    (folder / "notes").mkdir()
+    assert latest_checkpoint(folder).name == "step-00000008"
+    assert sorted(p.name for p in folder.glob("step-*")) == ["step-00000004", "step-00000008"]
+
+
+def test_waiting_and_speed_are_reported(tmp_path):
+    reports: list[StepReport] = []
+
+    class Slow(ToySource):
+        def batches(self, epoch, samples_consumed):
+            for placed in super().batches(epoch, samples_consumed):
+                time.sleep(0.05)
+                yield placed
+
+    run(tmp_path, settings(4), source=Slow(4), report=reports.append)
+    assert all(0.5 < report.waiting_share <= 1.0 for report in reports[1:])
+    assert all(0.0 < report.samples_per_s < 90.0 for report in reports)
