@@ -47,8 +47,9 @@ def clip_windows(
 
     Frames are the simulated ones nearest to the clip's times, so that contacts are as simulated.
     A window that begins before the grasp needs a table under the object; with `pickup_probability`
-    these come first, otherwise last. Sequences that begin in mid-air are drawn from the grasp on.
-    Raises SamplingError when the motion is too short.
+    these come first, otherwise last. When no window at the drawn rate works, faster and slower ones
+    follow. Sequences that begin in mid-air are drawn from the grasp on. Raises SamplingError when
+    the motion is too short.
     """
     wants_pickup = rng.uniform() < config.pickup_probability
     first = max(
@@ -64,7 +65,22 @@ def clip_windows(
             f"frame {first} are too few for clips of {config.n_frames} frames at {config.fps} fps; "
             "raise clip.fps or lower clip.n_frames"
         )
-    fps = fitting[rng.integers(len(fitting))]
+    drawn = fitting[rng.integers(len(fitting))]
+    others = sorted((fps for fps in fitting if fps != drawn), reverse=True)
+    for fps in (drawn, *others):
+        yield from _windows_at(fps, first, wants_pickup, sequence, config, rng)
+
+
+def _windows_at(
+    fps: float,
+    first: int,
+    wants_pickup: bool,
+    sequence: GraspSequence,
+    config: ClipConfig,
+    rng: np.random.Generator,
+) -> Iterator[ClipWindow]:
+    """Windows of one rate that begin at frame `first` or later, in random order."""
+    n_frames = len(sequence.T_world_from_obj)
     offsets = np.round(np.arange(config.n_frames) * sequence.fps / fps).astype(int)
     last = n_frames - 1 - offsets[-1]
     starts = np.unique(np.linspace(first, last, CANDIDATES).astype(int))

@@ -221,5 +221,5 @@ def test_all_twenty_objects_of_the_sample_render_into_one_verified_shard(tmp_pat
     dataset = rendered(write_config(tmp_path, change), tmp_path / "out")
     (report,) = verify_dataset(dataset.path)
     assert report.ok, report.findings
-    assert len({clip.object_uid.partition("@")[0] for clip in dataset.clips()}) + len(report.skipped) == 20
-    assert len(report.skipped) <= 1, report.skipped
+    assert report.skipped == ()
+    assert len({clip.object_uid.partition("@")[0] for clip in dataset.clips()}) == 20

@@ -172,6 +172,14 @@ def test_more_moving_parts_come_first(make_sequence, config):
     assert np.mean(moving) > 1.3 * np.mean(still)
 
 
+def test_other_rates_follow_when_no_window_of_the_drawn_one_works(make_sequence, config):
+    """A motion that is held for a moment only can still be drawn, faster."""
+    rates = [window.fps for window in clip_windows(make_sequence(), config.clip, np.random.default_rng(4))]
+    changes = [rates[0], *(b for a, b in zip(rates, rates[1:]) if a != b)]
+    assert sorted(changes) == sorted(config.clip.fps)  # each rate in one go, the drawn one first
+    assert changes[1:] == sorted(changes[1:], reverse=True)
+
+
 def test_movement_adds_turn_and_travel():
     T = np.tile(np.eye(4), (3, 1, 1))
     T[1, :3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
