@@ -1,6 +1,7 @@
 """A sampled scene: repeatable, independent streams, nothing floats or sinks, true labels."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -175,7 +176,7 @@ def test_more_moving_parts_come_first(make_sequence, config):
 def test_other_rates_follow_when_no_window_of_the_drawn_one_works(make_sequence, config):
     """A motion that is held for a moment only can still be drawn, faster."""
     rates = [window.fps for window in clip_windows(make_sequence(), config.clip, np.random.default_rng(4))]
-    changes = [rates[0], *(b for a, b in zip(rates, rates[1:]) if a != b)]
+    changes = [rates[0], *(b for a, b in pairwise(rates) if a != b)]
     assert sorted(changes) == sorted(config.clip.fps)  # each rate in one go, the drawn one first
     assert changes[1:] == sorted(changes[1:], reverse=True)
 
