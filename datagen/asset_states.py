@@ -173,40 +173,41 @@ def _html(config: DatasetConfig) -> AssetState:
 
 
 def _graspxl_motions(config: DatasetConfig) -> AssetState:
-    missing = AssetState(
-        name="GraspXL motions",
-        state="missing",
-        version="",
-        licence=GRASPXL_LICENCE,
-        place=_NOWHERE,
-        setting="motions.graspxl_root, GRASPXL",
-        how_to_get="form at github.com/zdchan/GraspXL: mano_dataset_1..3.zip; a sample is its dataset_example",
-    )
-    try:
-        root = graspxl_root(config.motions.graspxl_root)
-    except InputError:
-        return missing
-    state = _found(missing, "", root)
-    if not root.is_dir():
-        return replace(state, state="missing")
-
-    def version() -> str:
+    def version(root: Path) -> str:
         found = find_sequences(root, SIZES)
         parts, objects = {file.part for file in found}, {file.object_uid for file in found}
         return f"{len(found):,} sequences of {len(objects):,} objects in {', '.join(sorted(parts))}"
 
-    return _checked(state, version)
+    archives = "mano_dataset_1..3.zip; a sample is its dataset_example"
+    return _graspxl(config, "GraspXL motions", archives, version)
 
 
 def _graspxl_objects(config: DatasetConfig) -> AssetState:
+    def version(root: Path) -> str:
+        library = GraspXLObjects(
+            root,
+            None,
+            textures="none",
+            registration=config.objects.registration,
+            reading=config.objects.reading,
+            preparation=config.objects.preparation,
+            cache_dir=Path(),
+        )
+        return f"{len(library.uids()):,} meshes"
+
+    return _graspxl(config, "GraspXL objects", "object_dataset.zip", version)
+
+
+def _graspxl(config: DatasetConfig, name: str, archives: str, version: Callable[[Path], str]) -> AssetState:
+    """One of the two halves of GraspXL, which lie in one folder."""
     missing = AssetState(
-        name="GraspXL objects",
+        name=name,
         state="missing",
         version="",
         licence=GRASPXL_LICENCE,
         place=_NOWHERE,
         setting="motions.graspxl_root, GRASPXL",
-        how_to_get="form at github.com/zdchan/GraspXL: object_dataset.zip",
+        how_to_get=f"form at github.com/zdchan/GraspXL: {archives}",
     )
     try:
         root = graspxl_root(config.motions.graspxl_root)
@@ -214,24 +215,7 @@ def _graspxl_objects(config: DatasetConfig) -> AssetState:
         return missing
     if not root.is_dir():
         return replace(missing, place=str(root))
-    objects = config.objects
-    state = _found(missing, "", root)
-    return _checked(
-        state,
-        lambda: "{:,} meshes".format(
-            len(
-                GraspXLObjects(
-                    root,
-                    None,
-                    textures="none",
-                    registration=objects.registration,
-                    reading=objects.reading,
-                    preparation=objects.preparation,
-                    cache_dir=Path(),
-                ).uids()
-            )
-        ),
-    )
+    return _checked(_found(missing, "", root), lambda: version(root))
 
 
 def _objaverse(config: DatasetConfig) -> AssetState:

@@ -8,7 +8,7 @@ machine, in any order, is the same.
 import os
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
@@ -193,8 +193,3 @@ def read_plan(path: Path) -> Plan:
             f"{path}: not a readable plan ({error}); delete it and run datagen plan again"
         ) from error
     return Plan(motions=motions)
-
-
-def same_plan(a: Plan, b: Plan) -> bool:
-    """Whether two plans say the same, field by field."""
-    return [asdict(m) for m in a.motions] == [asdict(m) for m in b.motions]

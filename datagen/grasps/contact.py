@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.grasps.object_surface import ObjectSurface
+from datagen.grasps.object_surface import ObjectSurface, verts_in_object
 from datagen.hands.model import DIGITS, JOINT_NAMES, HandModel
 
 __all__ = ["TOUCHING_M", "digit_distances", "digit_of_vertex", "digits_touching", "signed_distances"]
@@ -23,8 +23,7 @@ def signed_distances(
     T_world_from_obj: Float[np.ndarray, "instant 4 4"],
 ) -> Float[np.ndarray, "instant vert"]:
     """Distance of hand vertices to the object's surface, metres, negative inside."""
-    R, t = T_world_from_obj[:, :3, :3], T_world_from_obj[:, :3, 3]
-    verts_obj = np.einsum("tvi,tij->tvj", verts_world - t[:, None], R)
+    verts_obj = verts_in_object(verts_world, T_world_from_obj)
     return surface.distance(verts_obj.reshape(-1, 3)).reshape(verts_world.shape[:2])
 
 

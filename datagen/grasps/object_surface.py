@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from datagen.objects.asset import ObjectAsset
 
-__all__ = ["ObjectSurface"]
+__all__ = ["ObjectSurface", "verts_in_object"]
 
 
 class ObjectSurface:
@@ -41,3 +41,11 @@ class ObjectSurface:
             igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER,
         )[0]
         return signed
+
+
+def verts_in_object(
+    verts_world: Float[np.ndarray, "instant vert 3"], T_world_from_obj: Float[np.ndarray, "instant 4 4"]
+) -> Float[np.ndarray, "instant vert 3"]:
+    """Hand vertices in the frame of the object, instant by instant."""
+    R, t = T_world_from_obj[:, :3, :3], T_world_from_obj[:, :3, 3]
+    return np.einsum("tvi,tij->tvj", verts_world - t[:, None], R)

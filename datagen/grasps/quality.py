@@ -10,7 +10,7 @@ from datagen.grasps.config import GraspConfig
 from datagen.grasps.contact import digit_distances, signed_distances
 from datagen.grasps.hand_body import HandBody, local_rotations
 from datagen.grasps.movement import Movement
-from datagen.grasps.object_surface import ObjectSurface
+from datagen.grasps.object_surface import ObjectSurface, verts_in_object
 from datagen.grasps.sequence import GraspQuality, TableEdge
 from datagen.grasps.simulation import Failure, MotionTrace
 from datagen.hands.model import HandModel, PosedHand
@@ -66,8 +66,7 @@ def penetration_depths(
     T_world_from_obj: Float[np.ndarray, "instant 4 4"],
 ) -> Float[np.ndarray, "instant vert"]:
     """Depth of every hand vertex inside the object (m)."""
-    R, t = T_world_from_obj[:, :3, :3], T_world_from_obj[:, :3, 3]
-    verts_obj = np.einsum("tvi,tij->tvj", verts_world - t[:, None], R)
+    verts_obj = verts_in_object(verts_world, T_world_from_obj)
     return surface.depth(verts_obj.reshape(-1, 3)).reshape(verts_world.shape[:2])
 
 
