@@ -4,7 +4,6 @@ Each section is a dataclass beside the code it configures; this file assembles t
 YAML strictly.
 """
 
-import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -18,23 +17,29 @@ from model.encoders.hand_training import HandLossConfig
 from model.encoders.wilor import WilorConfig
 from model.errors import ModelError
 from model.flow import LogitNormalTime, SamplerSettings, UniformTime
+from model.networks.lora import LoraSettings
 from model.sparse_structure.dual_branch import DualBranchConfig
 from model.sparse_structure.vae import VaeConfig
 from model.stream_config import StreamConfig
 from model.training.config import OptimizerConfig, TrainerConfig
+from model.weights.weight_file import StartConfig
 from shards.settings import SettingsError, settings_from_dict
+from shards.splits import Split
 
 __all__ = [
     "EncodersConfig",
     "HandPart",
+    "ImportedVae",
     "OwnHandEncoder",
+    "PackagedHandEncoder",
     "Recipe",
     "StageOnePart",
     "TrainingConfig",
     "VaePart",
     "ValidationConfig",
+    "as_yaml",
     "load_config",
-    "part_sha256",
+    "parse_config",
 ]
 
 
@@ -51,10 +56,19 @@ class Recipe:
 
 @dataclass(frozen=True, kw_only=True)
 class VaePart:
-    """The sparse-structure VAE."""
+    """The sparse-structure VAE, trained here; `turn`: on shapes in all 48 orientations of the cube."""
 
     network: VaeConfig
+    turn: bool
     recipe: Recipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedVae:
+    """The sparse-structure VAE with weights that are there already."""
+
+    network: VaeConfig
+    weights: Path  # made by `forehoi weights import`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,19 +88,32 @@ class OwnHandEncoder:
 
 
 @dataclass(frozen=True, kw_only=True)
+class PackagedHandEncoder:
+    """The hand encoder that ships with the package, on a token grid of its own."""
+
+    packaged_grid: int
+
+
+@dataclass(frozen=True, kw_only=True)
 class EncodersConfig:
     """Frozen encoders of the pictures."""
 
     image: EfficientNetConfig | DinoConfig
-    hand: OwnHandEncoder | WilorConfig
+    hand: OwnHandEncoder | PackagedHandEncoder | WilorConfig
     cached_views: int  # pictures whose features are kept; of use where crops repeat, 0: none
 
 
 @dataclass(frozen=True, kw_only=True)
 class StageOnePart:
-    """The dual-branch flow and its feature aggregator."""
+    """The dual-branch flow and its feature aggregator.
+
+    `start`: weights to start from, null for random ones. `lora`: adapt the attention projections of the geometry
+    branch and freeze the rest of it, null to train it whole; everything else always trains whole.
+    """
 
     network: DualBranchConfig
+    start: StartConfig | None
+    lora: LoraSettings | None
     hand_width: int  # of the aggregator (section 3.1)
     hidden: int
     beta: float
@@ -97,13 +124,26 @@ class StageOnePart:
     guidance_interval: tuple[float, float]
     recipe: Recipe
 
+    def __post_init__(self) -> None:
+        if self.lora is not None and self.start is None:
+            raise ValueError(
+                "lora adapts weights that are there, and start is null: expected a file to start from; "
+                "name one (`forehoi weights import`), or set lora to null"
+            )
+
 
 @dataclass(frozen=True, kw_only=True)
 class ValidationConfig:
-    """What the figures while training are measured on: held-out cameras of training motions."""
+    """What the figures while training are measured on.
 
+    `split`: that of the training for held-out cameras of its motions, another one for all cameras of objects
+    that were never trained on.
+    """
+
+    split: Split
     views: int
     batch_size: int
+    samples_per_motion: int  # each with its own views
     batches: int  # at most
 
 
@@ -115,8 +155,8 @@ class TrainingConfig:
     data: StreamConfig
     validation: ValidationConfig
     encoders: EncodersConfig
-    vae: VaePart
-    hand_encoder: HandPart
+    vae: VaePart | ImportedVae
+    hand_encoder: HandPart | None  # null: encoders.hand is not trained here
     stage_one: StageOnePart
 
     def __post_init__(self) -> None:
@@ -133,26 +173,37 @@ class TrainingConfig:
                 f"stage_one.network.geometry takes latents {network.geometry.latent_shape}, the VAE makes {latent}: "
                 "expected the same shape; correct latent_resolution and latent_channels, or vae.network.channels"
             )
+        own = isinstance(self.encoders.hand, OwnHandEncoder)
+        if own != (self.hand_encoder is not None):
+            raise ValueError(
+                "encoders.hand is the own hand encoder and hand_encoder is null: expected how to train it"
+                if own
+                else "hand_encoder is trained and encoders.hand uses another: expected hand_encoder to be null"
+            )
 
 
 def load_config(path: Path) -> TrainingConfig:
     """Read a complete YAML file; SettingsError names file, key, expected and found."""
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise ModelError(
             path, "does not exist", expected="a training configuration", action="See configs/model."
         ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
         raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    return settings_from_dict(TrainingConfig, data, where=str(path))
+    return parse_config(text, where=str(path))
+
+
+def parse_config(text: str, *, where: str) -> TrainingConfig:
+    """A complete configuration from YAML text, e.g. of a checkpoint; `where` names it in errors."""
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
+    return settings_from_dict(TrainingConfig, data, where=where)
 
 
 def as_yaml(config: object) -> str:
     """A configuration, or a part of one, as text that `load_config` reads back."""
     return yaml.safe_dump(json.loads(json.dumps(asdict(config), default=str)), sort_keys=False)  # type: ignore[call-overload]
-
-
-def part_sha256(*parts: object) -> str:
-    """Changes when anything that decides the trained weights of a part changes."""
-    return hashlib.sha256("\n".join(as_yaml(part) for part in parts).encode()).hexdigest()

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from model.errors import ModelError
-from model.sample import TrainingSample
+from model.sample import ObjectSurface, TrainingSample
 from shards.images import MASK_BITS
 
 __all__ = [
@@ -24,6 +24,7 @@ __all__ = [
     "crop_masks",
     "draw_crop",
     "mirrored",
+    "mirrored_surface",
     "union_box",
 ]
 
@@ -178,6 +179,18 @@ def mirrored(sample: TrainingSample) -> TrainingSample:
         occupancy=sample.occupancy[::-1],
         joints_px=joints_px,
         is_right=not sample.is_right,
+        surface=None if sample.surface is None else mirrored_surface(sample.surface),
+    )
+
+
+def mirrored_surface(surface: ObjectSurface) -> ObjectSurface:
+    """The surface of the object in the mirror, x -> -x: its own inverse."""
+    F = np.array([-1.0, 1.0, 1.0], np.float32)
+    return replace(
+        surface,
+        points=surface.points * F,
+        normals=surface.normals * F,
+        sdf_points=surface.sdf_points * F,
     )
 
 

@@ -24,6 +24,7 @@ __all__ = [
     "TimeDistribution",
     "UniformTime",
     "Velocity",
+    "binary_velocity",
     "clean_from_velocity",
     "euler_path",
     "euler_sample",
@@ -95,21 +96,37 @@ def velocity_from_noise(
 
 
 def preconditioned_velocity(
-    x_t: Float[Tensor, "batch *shape"],
-    output: Float[Tensor, "batch *shape"],
-    t: Float[Tensor, " batch"],
-    *,
-    clean_std: float,
+    x_t: Float[Tensor, "batch *shape"], output: Float[Tensor, "batch *shape"], t: Float[Tensor, " batch"]
 ) -> Float[Tensor, "batch *shape"]:
-    """The best linear guess of the velocity from x_t, plus the network's output scaled to what remains.
+    """The best linear guess of the velocity from x_t for clean tensors of unit variance, plus scaled output.
 
-    With S = (1-t)² s² + t², s the root mean square of clean: velocity = (t - (1-t) s²) / S x_t + s / sqrt(S) output.
-    The output's target then has unit variance at every t and is -clean / s at t = 1, so a small network need
-    not learn to copy noise from its input (the argument of Karras et al. 2022, Eq. 7, for this path).
+    With S = (1 - t)^2 + t^2: velocity = (2 t - 1) / S x_t + output / sqrt(S). The output's target has unit
+    variance at every t, is uncorrelated with x_t, and is -clean at t = 1: a small network need not copy noise from
+    its input to its output (the argument of Karras et al. 2022, Eq. 7, for this path).
     """
     time = _per_sample(t, x_t)
-    variance = ((1 - time) * clean_std) ** 2 + time**2
-    return (time - (1 - time) * clean_std**2) / variance * x_t + clean_std * variance.rsqrt() * output
+    variance = (1 - time) ** 2 + time**2
+    return (2 * time - 1) / variance * x_t + variance.rsqrt() * output
+
+
+_MIN_TIME = 1e-3
+
+
+def binary_velocity(
+    x_t: Float[Tensor, "batch *shape"],
+    half_log_odds: Float[Tensor, "batch *shape"],
+    t: Float[Tensor, " batch"],
+) -> Float[Tensor, "batch *shape"]:
+    """Velocity of a tensor that is -1 or +1 when clean, from half the log-odds of +1 apart from its own noise.
+
+    The noisy value is itself evidence with half log-odds (1 - t) x_t / t^2, so by Bayes' rule
+    E[clean | x_t] = tanh((1 - t) x_t / t^2 + half_log_odds) and velocity = (x_t - E[clean | x_t]) / t, the
+    minimiser of Eq. 2. A network that outputs `half_log_odds` need only segment, and never copy noise.
+    Below t = 0.001, where x_t gives the clean value away, the velocity falls to zero.
+    """
+    time = _per_sample(t, x_t.float()).clamp(min=_MIN_TIME)
+    x, prior = x_t.to(time.dtype), half_log_odds.to(time.dtype)
+    return ((x - torch.tanh((1 - time) * x / time**2 + prior)) / time).to(x_t.dtype)
 
 
 @dataclass(frozen=True, kw_only=True)

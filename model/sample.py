@@ -9,11 +9,33 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-__all__ = ["OCCUPANCY_VOXELS", "Batch", "TrainingSample", "stack_samples"]
+from model.errors import ModelError
+
+__all__ = [
+    "OCCUPANCY_VOXELS",
+    "Batch",
+    "ObjectSurface",
+    "SurfaceBatch",
+    "TrainingSample",
+    "join_surfaces",
+    "stack_samples",
+]
 
 OCCUPANCY_VOXELS = 64
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectSurface:
+    """Samples of an object's true surface and of its signed distance; canonical frame and unit."""
+
+    points: Float32[np.ndarray, "surface 3"]
+    normals: Float32[np.ndarray, "surface 3"]  # outward, unit
+    colors: UInt8[np.ndarray, "surface 3"]  # sRGB base colour, unshaded
+    sdf_points: Float32[np.ndarray, "sample 3"]
+    sdf_values: Float32[np.ndarray, "sample"]  # negative inside
+    object_scale_m: float  # metres per canonical unit
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -34,6 +56,44 @@ class TrainingSample:
     occupancy: Bool[np.ndarray, "64 64 64"]  # [i, j, k] along x, y, z of the canonical frame
     joints_px: Float32[np.ndarray, "view 21 2"]  # NaN behind the camera
     is_right: bool
+    surface: ObjectSurface | None = None  # read only where StreamConfig.surface asks for it
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SurfaceBatch:
+    """`ObjectSurface` of several samples, their rows one after another: objects may have different numbers of them."""
+
+    points: Float[torch.Tensor, "surface 3"]
+    normals: Float[torch.Tensor, "surface 3"]
+    colors: UInt8[torch.Tensor, "surface 3"]
+    sdf_points: Float[torch.Tensor, "sample 3"]
+    sdf_values: Float[torch.Tensor, "sample"]
+    point_counts: tuple[int, ...]  # rows of `points` of each sample
+    sdf_counts: tuple[int, ...]
+    object_uids: tuple[str, ...]
+    object_scales_m: tuple[float, ...]
+
+    def part(self, start: int, stop: int) -> "SurfaceBatch":
+        """The samples start .. stop - 1."""
+        chosen = slice(start, stop)
+        points = slice(sum(self.point_counts[:start]), sum(self.point_counts[:stop]))
+        samples = slice(sum(self.sdf_counts[:start]), sum(self.sdf_counts[:stop]))
+        return SurfaceBatch(
+            points=self.points[points],
+            normals=self.normals[points],
+            colors=self.colors[points],
+            sdf_points=self.sdf_points[samples],
+            sdf_values=self.sdf_values[samples],
+            point_counts=self.point_counts[chosen],
+            sdf_counts=self.sdf_counts[chosen],
+            object_uids=self.object_uids[chosen],
+            object_scales_m=self.object_scales_m[chosen],
+        )
+
+    def to(self, device: torch.device | str) -> "SurfaceBatch":
+        """On `device`, float32."""
+        names = [f.name for f in fields(self) if isinstance(getattr(self, f.name), torch.Tensor)]
+        return replace(self, **{name: getattr(self, name).to(device, non_blocking=True) for name in names})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +110,24 @@ class Batch:
     joints_px: Float[torch.Tensor, "batch view 21 2"]  # NaN behind the camera
     is_right: Bool[torch.Tensor, "batch"]
     ids: tuple[str, ...]  # "motion_id:epoch:position", one per sample
+    surface: SurfaceBatch | None = None  # read only where StreamConfig.surface asks for it
+
+    @property
+    def true_surface(self) -> SurfaceBatch:
+        """`surface` where it was read; ModelError otherwise."""
+        if self.surface is None:
+            raise ModelError(
+                "batch",
+                "comes without the objects' surfaces",
+                expected="a stream that reads them",
+                action="Set `surface` in its StreamConfig.",
+            )
+        return self.surface
+
+    def part(self, start: int, stop: int) -> "Batch":
+        """The samples start .. stop - 1."""
+        rows = {f.name: getattr(self, f.name)[start:stop] for f in fields(self) if f.name != "surface"}
+        return Batch(**rows, surface=None if self.surface is None else self.surface.part(start, stop))
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "Batch":
         """On `device`, with images as `dtype`.
@@ -59,10 +137,14 @@ class Batch:
         moved = {
             f.name: getattr(self, f.name).to(device, non_blocking=True)
             for f in fields(self)
-            if f.name != "ids"
+            if f.name not in _NOT_STACKED
         }
         moved["images"] = moved["images"].to(dtype)
-        return replace(self, **moved)
+        surface = None if self.surface is None else self.surface.to(device)
+        return replace(self, **moved, surface=surface)
+
+
+_NOT_STACKED = ("ids", "surface")
 
 
 def stack_samples(samples: Sequence[TrainingSample], ids: Sequence[str], *, shared: bool = False) -> Batch:
@@ -80,11 +162,41 @@ def stack_samples(samples: Sequence[TrainingSample], ids: Sequence[str], *, shar
             view[index] = array  # also undoes the negative strides of a mirrored sample
         return out
 
-    return Batch(**{f.name: stacked(f.name) for f in fields(Batch) if f.name != "ids"}, ids=tuple(ids))
+    surfaces = [sample.surface for sample in samples if sample.surface is not None]
+    return Batch(
+        **{f.name: stacked(f.name) for f in fields(Batch) if f.name not in _NOT_STACKED},
+        ids=tuple(ids),
+        surface=join_surfaces(surfaces, [s.object_uid for s in samples], shared=shared) if surfaces else None,
+    )
+
+
+def join_surfaces(
+    surfaces: Sequence[ObjectSurface], object_uids: Sequence[str], *, shared: bool = False
+) -> SurfaceBatch:
+    """The surfaces of a batch, in order; `shared` as in `stack_samples`."""
+
+    def joined(name: str) -> torch.Tensor:
+        arrays = [getattr(surface, name) for surface in surfaces]
+        out = _empty((sum(map(len, arrays)), *arrays[0].shape[1:]), arrays[0].dtype, shared=shared)
+        np.concatenate(arrays, out=out.numpy())
+        return out
+
+    names = ("points", "normals", "colors", "sdf_points", "sdf_values")
+    return SurfaceBatch(
+        **{name: joined(name) for name in names},  # type: ignore[arg-type]
+        point_counts=tuple(len(surface.points) for surface in surfaces),
+        sdf_counts=tuple(len(surface.sdf_points) for surface in surfaces),
+        object_uids=tuple(object_uids),
+        object_scales_m=tuple(surface.object_scale_m for surface in surfaces),
+    )
 
 
 def _empty(shape: tuple[int, ...], dtype: np.dtype, *, shared: bool) -> torch.Tensor:
-    torch_dtype = {np.dtype(np.float32): torch.float32, np.dtype(bool): torch.bool}[dtype]
+    torch_dtype = {
+        np.dtype(np.float32): torch.float32,
+        np.dtype(bool): torch.bool,
+        np.dtype(np.uint8): torch.uint8,
+    }[dtype]
     if not shared:
         return torch.empty(shape, dtype=torch_dtype)
     n_bytes = int(np.prod(shape)) * dtype.itemsize

@@ -17,7 +17,7 @@ from model.crop import CroppedMasks, SquareCrop, crop_image, crop_masks, draw_cr
 from model.data_order import RandomStream, SampleKey, random_stream
 from model.frame_pages import FramePages, local_pages
 from model.motion_index import FRAME_COLUMNS, MotionIndex, MotionRef
-from model.sample import OCCUPANCY_VOXELS, TrainingSample
+from model.sample import OCCUPANCY_VOXELS, ObjectSurface, TrainingSample
 from model.stream_config import StreamConfig
 from shards.errors import CorruptShardError, ImageError, RowError
 from shards.reader import Table
@@ -32,6 +32,15 @@ _MAX_OBJECTS = 512
 _MAX_CLIP_TABLES = 64
 _MAX_OPEN_FILES = 64
 _NUMBER_COLUMNS = tuple(name for name in FRAME_COLUMNS if name not in BLOB_COLUMNS)
+_TARGET_COLUMNS = ("T_objmesh_from_canonical", "occupancy_64")
+_SURFACE_COLUMNS = (
+    "surface_points",
+    "surface_normals",
+    "surface_colors",
+    "sdf_points",
+    "sdf_values",
+    "object_scale_m",
+)
 _CLIP_COLUMNS = ("clip_id", "K", "image_width", "image_height", "hand_side")
 
 
@@ -39,6 +48,7 @@ _CLIP_COLUMNS = ("clip_id", "K", "image_width", "image_height", "hand_side")
 class _Object:
     T_objmesh_from_canonical: Float[np.ndarray, "4 4"]
     voxels: UInt8[np.ndarray, "voxel 3"]
+    surface: ObjectSurface | None
 
     def occupancy(self) -> Bool[np.ndarray, "64 64 64"]:
         grid = np.zeros((OCCUPANCY_VOXELS,) * 3, bool)
@@ -126,6 +136,7 @@ class SampleReader:
             occupancy=target.occupancy(),
             joints_px=np.stack([view.joints_px for view in views]).astype(np.float32),
             is_right=clips["hand_side"][motion.clip_rows[0]] == "right",
+            surface=target.surface,
         )
         return mirrored(sample) if flip else sample
 
@@ -175,14 +186,29 @@ class SampleReader:
         for group in range(source.num_row_groups):
             uids = source.read_row_group(group, ["object_uid"])["object_uid"].to_pylist()
             if motion.object_uid in uids:
-                columns = ["T_objmesh_from_canonical", "occupancy_64"]
-                table = Table(source.read_row_group(group, columns), ObjectRow, where=source.path)
+                columns = _TARGET_COLUMNS + (_SURFACE_COLUMNS if self._config.surface else ())
+                table = Table(source.read_row_group(group, list(columns)), ObjectRow, where=source.path)
                 row = uids.index(motion.object_uid)
                 voxels = table["occupancy_64"][row]
                 if len(voxels) and voxels.max() >= OCCUPANCY_VOXELS:
                     raise RowError("voxel outside 0..63", where=source.path, row=motion.object_uid)
-                return _Object(T_objmesh_from_canonical=table["T_objmesh_from_canonical"][row], voxels=voxels)
+                return _Object(
+                    T_objmesh_from_canonical=table["T_objmesh_from_canonical"][row],
+                    voxels=voxels,
+                    surface=_surface(table, row) if self._config.surface else None,
+                )
         raise CorruptShardError("no such object", where=source.path, row=motion.object_uid)
+
+
+def _surface(table: Table, row: int) -> ObjectSurface:
+    return ObjectSurface(
+        points=table["surface_points"][row],
+        normals=table["surface_normals"][row],
+        colors=table["surface_colors"][row],
+        sdf_points=table["sdf_points"][row],
+        sdf_values=table["sdf_values"][row],
+        object_scale_m=float(table["object_scale_m"][row]),
+    )
 
 
 def _planes(images: list[UInt8[np.ndarray, "size size 3"]]) -> Float32[np.ndarray, "view 3 size size"]:

@@ -32,6 +32,8 @@ class StreamConfig:
     cache_mb: int  # of encoded clips, per worker
     on_corrupt: Literal["raise", "skip"]  # skip: another sample takes the place, the row is counted
     max_corrupt: int  # distinct corrupt rows before a stream that skips gives up
+    # Also read the objects' surface samples. What is trained decides it, not the user: hence the default.
+    surface: bool = False
 
     def __post_init__(self) -> None:
         checks = (

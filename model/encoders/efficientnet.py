@@ -18,14 +18,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from model.encoders.token_grid import CellCentres, resampled_tokens, resized
+from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
 
 __all__ = ["EfficientNetConfig", "EfficientNetEncoder", "load_efficientnet"]
 
-# Last block of each resolution -> stride in pixels. 24 + 40 + 112 + 320 channels.
+# Last block of each resolution -> stride in pixels, and stride -> channels.
 _STRIDE_AFTER_BLOCK = {2: 4, 4: 8, 10: 16, 15: 32}
-_CHANNELS = 24 + 40 + 112 + 320
+_CHANNELS = {4: 24, 8: 40, 16: 112, 32: 320}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,7 +47,7 @@ class EfficientNetConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EfficientNetEncoder:
-    """Features of strides 4, 8, 16 and 32, each layer-normalised, side by side: 496 channels.
+    """Features of strides 4, 8, 16 and 32, each layer-normalised, side by side: 568 channels at 128 px on a 16 grid.
 
     The norm (no parameters, as TRELLIS applies to DINOv2's tokens, FORMATS 4.5) gives every stride the
     same weight.
@@ -62,7 +62,8 @@ class EfficientNetEncoder:
 
     @property
     def channels(self) -> int:
-        return _CHANNELS
+        size, grid = self.config.image_size, self.grid
+        return sum(n * cells_per_token(size // stride, grid) ** 2 for stride, n in _CHANNELS.items())
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "EfficientNetEncoder":
         self.network.to(device, dtype)
@@ -78,8 +79,8 @@ class EfficientNetEncoder:
         tokens = []
         for index, block in enumerate(self.network._blocks):
             features = block(features)
-            if stride := _STRIDE_AFTER_BLOCK.get(index):
-                level = resampled_tokens(features, CellCentres.aligned(size // stride), self.grid)
+            if index in _STRIDE_AFTER_BLOCK:
+                level = detailed_tokens(features, self.grid)
                 tokens.append(functional.layer_norm(level, level.shape[-1:]))
         return torch.cat(tokens, dim=-1).unflatten(0, images.shape[:2]).to(images.dtype)
 

@@ -1,6 +1,7 @@
-"""The open hand encoder: a small CNN, trained on our own shards to find the hand and its 21 joints.
+"""The open hand encoder: a small CNN, trained on our own shards to find the hand, its 21 joints and what it holds.
 
-`forehoi train hand_encoder` makes its weights (`hand_training.py`); it sees the same crop as the image encoder.
+`forehoi train hand_encoder` makes its weights (`hand_training.py`); `packaged_hand_net` gives those that ship with
+the package (model/encoders/data). It sees the same crop as the image encoder.
 """
 
 import json
@@ -15,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from model.encoders.token_grid import CellCentres, resampled_tokens, resized
+from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "HandNetConfig",
     "HandOutput",
     "load_hand_net",
+    "packaged_hand_net",
     "save_hand_net",
 ]
 
@@ -37,7 +39,7 @@ _ACTION = "Make it with `forehoi train hand_encoder`, or give the folder of one 
 @dataclass(frozen=True, kw_only=True)
 class HandNetConfig:
     """`image_size`: pixels at which it runs, a multiple of 16. `widths`: channels at strides 2, 4, 8 and 16,
-    `decoder`: channels of the stride-4 map that mask and joints are read from; all multiples of 8."""
+    `decoder`: channels of the stride-4 map that masks and joints are read from; all multiples of 8."""
 
     image_size: int
     widths: tuple[int, int, int, int]
@@ -61,6 +63,8 @@ class HandOutput:
 
     mask_logits: Float[Tensor, "view cell cell"]
     """Hand and arm, as far as visible."""
+    object_logits: Float[Tensor, "view cell cell"]
+    """The held object, as far as visible: told from other things by the hand on it."""
     joint_logits: Float[Tensor, "view 21 cell cell"]
     """Where each joint is, hidden or not; a softmax over the cells makes a distribution of it."""
     right_logit: Float[Tensor, "view"]
@@ -98,28 +102,32 @@ class HandNet(nn.Module):
         )
         self.up_8 = _convolution(config.decoder, config.decoder, 3)
         self.up_4 = _convolution(config.decoder, config.decoder, 3)
-        self.maps = nn.Conv2d(config.decoder, 1 + N_JOINTS, 1)
+        self.maps = nn.Conv2d(config.decoder, 2 + N_JOINTS, 1)
         self.side = nn.Linear(w16, 1)
 
-    @property
-    def channels(self) -> int:
+    def channels(self, grid: int) -> int:
         """Width of a token of `features`."""
-        return self.config.decoder + self.config.widths[-1]
+        counts = (self.config.image_size // _STRIDES[1], self.config.image_size // _STRIDES[-1])
+        fine, coarse = (cells_per_token(count, grid) ** 2 for count in counts)
+        return fine * self.config.decoder + coarse * self.config.widths[-1]
 
     def forward(self, images: Float[Tensor, "view 3 size size"]) -> HandOutput:
         """Predictions for sRGB pictures in 0..1 of any size."""
         fine, coarse = self._decoded(images)
         maps = self.maps(fine)
         return HandOutput(
-            mask_logits=maps[:, 0], joint_logits=maps[:, 1:], right_logit=self.side(coarse.mean((2, 3)))[:, 0]
+            mask_logits=maps[:, 0],
+            object_logits=maps[:, 1],
+            joint_logits=maps[:, 2:],
+            right_logit=self.side(coarse.mean((2, 3)))[:, 0],
         )
 
     def features(
         self, images: Float[Tensor, "view 3 size size"], grid: int
     ) -> Float[Tensor, "view token channel"]:
-        """What the predictions are read from, as tokens: the stride-4 map (mask, joints) and the stride-16
+        """What the predictions are read from, as tokens: the stride-4 map (masks, joints) and the stride-16
         map (side, context), each layer-normalised without parameters."""
-        levels = [resampled_tokens(m, CellCentres.aligned(m.shape[-1]), grid) for m in self._decoded(images)]
+        levels = [detailed_tokens(level, grid) for level in self._decoded(images)]
         return torch.cat([functional.layer_norm(level, level.shape[-1:]) for level in levels], dim=-1)
 
     def _decoded(self, images: Tensor) -> tuple[Tensor, Tensor]:
@@ -144,7 +152,7 @@ class HandEncoder:
 
     @property
     def channels(self) -> int:
-        return self.network.channels
+        return self.network.channels(self.grid)
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "HandEncoder":
         self.network.to(device, dtype)
@@ -192,6 +200,11 @@ def load_hand_net(folder: Path) -> HandNet:
     except RuntimeError as error:
         raise _unusable(folder, f"the weights are of another layout than {_CONFIG} says") from error
     return network.eval().requires_grad_(False)
+
+
+def packaged_hand_net() -> HandNet:
+    """The hand encoder that ships with the package; how it was made: model/encoders/data/README.md."""
+    return load_hand_net(Path(__file__).parent / "data")
 
 
 def _unusable(folder: Path, problem: str) -> ModelError:

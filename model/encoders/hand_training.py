@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from model.encoders.hand import HandNet, HandOutput
+from model.evaluation.overlap import intersection_over_union
 from model.sample import Batch
 from model.training.task import Evaluation, Losses
 
@@ -21,8 +22,9 @@ _PICTURES = 8
 
 @dataclass(frozen=True, kw_only=True)
 class HandLossConfig:
-    """Mask loss + `joint_weight` x joint loss + `side_weight` x side loss."""
+    """Mask loss + `object_weight` x object loss + `joint_weight` x joint loss + `side_weight` x side loss."""
 
+    object_weight: float
     joint_weight: float
     side_weight: float
     sigma_cells: float
@@ -37,11 +39,15 @@ def hand_losses(
     batch: Batch,
     config: HandLossConfig,
 ) -> dict[str, Float[Tensor, "batch"]]:
-    """Losses of each sample: "mask" (cross-entropy + Dice, of hand and arm), "joints" (KL divergence of the
+    """Losses of each sample: "mask" (cross-entropy + Dice, of hand and arm), "object" (the same of
+    the visible part of the held object), "joints" (KL divergence of the
     predicted from a Gaussian distribution, over the joints inside the picture), "side" (cross-entropy)."""
     batch_view = batch.images.shape[:2]
     view_losses = {
-        "mask": _mask_loss(output.mask_logits.float(), _mask_at(batch, output.mask_logits.shape[-1])),
+        "mask": _mask_loss(output.mask_logits.float(), _covered(batch.hand_visible, output.mask_logits.shape[-1])),
+        "object": _mask_loss(
+            output.object_logits.float(), _covered(batch.object_visible, output.object_logits.shape[-1])
+        ),
         "joints": _joint_loss(output.joint_logits.float(), batch, config.sigma_cells),
         "side": functional.binary_cross_entropy_with_logits(
             output.right_logit.float(), _side(batch), reduction="none"
@@ -86,6 +92,7 @@ class HandTask:
         means = {name: loss.mean() for name, loss in parts.items()}
         total = (
             means["mask"]
+            + self.config.object_weight * means["object"]
             + self.config.joint_weight * means["joints"]
             + self.config.side_weight * means["side"]
         )
@@ -95,9 +102,9 @@ class HandTask:
     def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:
         """Figures over all views, and pictures of the first.
 
-        hand_mask_iou: hand and arm at stride 4, mean over views. hand_pck5: share of the joints in the
-        picture that are found within 5 % of its side; hand_joint_error: their mean error in % of the side.
-        hand_side_accuracy: right told from left.
+        hand_mask_iou: hand and arm at stride 4, mean over views; held_object_iou: the same of the visible object.
+        hand_pck5: share of the joints in the picture that are found within 5 % of its side; hand_joint_error:
+        their mean error in % of the side. hand_side_accuracy: right told from left.
         """
         sums = _Sums()
         pictures: dict[str, UInt8[np.ndarray, "height width 3"]] = {}
@@ -125,16 +132,18 @@ class _Sums:
     def __init__(self) -> None:
         self._values: dict[str, list[Tensor]] = {
             "hand_mask_iou": [],
+            "held_object_iou": [],
             "distance": [],
             "hand_side_accuracy": [],
         }
 
     def add(self, output: HandOutput, batch: Batch) -> None:
-        truth = _mask_at(batch, output.mask_logits.shape[-1]) > 0.5
-        predicted = output.mask_logits > 0
-        union = (truth | predicted).sum((1, 2))
-        iou = (truth & predicted).sum((1, 2)) / union.clamp_min(1)
-        self._values["hand_mask_iou"].append(iou[union > 0])
+        for name, logits, mask in (
+            ("hand_mask_iou", output.mask_logits, batch.hand_visible),
+            ("held_object_iou", output.object_logits, batch.object_visible),
+        ):
+            truth = _covered(mask, logits.shape[-1]) > 0.5
+            self._values[name].append(intersection_over_union(logits > 0, truth))
         position, inside = _true_joints(batch)
         distance = (joint_positions(output.joint_logits) - position).norm(dim=-1)
         self._values["distance"].append(distance[inside])
@@ -150,10 +159,9 @@ class _Sums:
         return {name: float(value.mean()) for name, value in values.items()}
 
 
-def _mask_at(batch: Batch, cells: int) -> Float[Tensor, "view cell cell"]:
-    """Share of each cell that hand or arm cover."""
-    masks = batch.hand_visible.flatten(0, 1).float()[:, None]
-    return functional.adaptive_avg_pool2d(masks, cells)[:, 0]
+def _covered(mask: Bool[Tensor, "batch view size size"], cells: int) -> Float[Tensor, "flat cell cell"]:
+    """Share of each cell that the mask covers."""
+    return functional.adaptive_avg_pool2d(mask.flatten(0, 1).float()[:, None], cells)[:, 0]
 
 
 def _side(batch: Batch) -> Float[Tensor, "view"]:
@@ -191,34 +199,37 @@ def _joint_loss(
 
 
 def _montage(output: HandOutput, batch: Batch) -> UInt8[np.ndarray, "height width 3"]:
-    """A column for each view: the picture; true mask and joints (green); predicted ones (red)."""
+    """A column for each view: the picture; what is true; what is predicted: hand green, object orange, joints."""
     images = batch.images.flatten(0, 1)[:_PICTURES].float().cpu()
     size = images.shape[-1]
     truth, inside = _true_joints(batch)
-    upsampled = functional.interpolate(
-        output.mask_logits[:, None].float(), size=(size, size), mode="bilinear"
+
+    def full(logits: Tensor) -> Tensor:
+        return functional.interpolate(logits[:, None].float(), size=(size, size), mode="bilinear")[:, 0].cpu() > 0
+
+    rows = (
+        (batch.hand_visible.flatten(0, 1).cpu(), batch.object_visible.flatten(0, 1).cpu(), truth.cpu()),
+        (full(output.mask_logits), full(output.object_logits), joint_positions(output.joint_logits).cpu()),
     )
-    masks = (batch.hand_visible.flatten(0, 1).cpu(), upsampled[:, 0].cpu() > 0)
-    points = (truth.cpu(), joint_positions(output.joint_logits).cpu())
     columns = []
     for view, image in enumerate(images):
-        rows = [image]
-        for mask, joints, color in zip(masks, points, ((0.1, 0.9, 0.2), (1.0, 0.25, 0.1))):
-            rows.append(_marked(image, mask[view], joints[view][inside[view].cpu()], torch.tensor(color)))
-        columns.append(torch.cat(rows, dim=1))
+        shown = [_marked(image, h[view], o[view], j[view][inside[view].cpu()]) for h, o, j in rows]
+        columns.append(torch.cat([image, *shown], dim=1))
     picture = torch.cat(columns, dim=2).permute(1, 2, 0)
     return (255 * picture.clamp(0, 1)).round().to(torch.uint8).numpy()
 
 
 def _marked(
     image: Float[Tensor, "3 size size"],
-    mask: Bool[Tensor, "size size"],
+    hand: Bool[Tensor, "size size"],
+    held: Bool[Tensor, "size size"],
     joints: Float[Tensor, "joint 2"],
-    color: Float[Tensor, "3"],
 ) -> Float[Tensor, "3 size size"]:
-    """Mask tinted, joints as white squares of about 1/40 of the side."""
+    """Masks tinted, joints as white squares of about 1/40 of the side."""
     size = image.shape[-1]
-    tinted = torch.where(mask, 0.5 * image + 0.5 * color[:, None, None], image)
+    tinted = image
+    for mask, color in ((hand, (0.1, 0.9, 0.2)), (held, (1.0, 0.45, 0.1))):
+        tinted = torch.where(mask, 0.5 * tinted + 0.5 * torch.tensor(color)[:, None, None], tinted)
     centres = (torch.arange(size) + 0.5) / size
     near = (centres - joints[..., None]).abs() <= 1 / 80
     dots = (near[:, 1, :, None] & near[:, 0, None, :]).any(0)

@@ -11,7 +11,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-__all__ = ["CellCentres", "resampled_tokens", "resized"]
+from model.networks.patches import patchify
+
+__all__ = ["CellCentres", "cells_per_token", "detailed_tokens", "resampled_tokens", "resized"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +49,27 @@ def resampled_tokens(
     weights = _weights(centres, features.shape[-1], grid).to(features.device, features.dtype)
     rows = torch.einsum("gi,vcij->vcgj", weights, features)
     return torch.einsum("hj,vcgj->vghc", weights, rows).flatten(1, 2)
+
+
+def cells_per_token(count: int, grid: int) -> int:
+    """How many cells along an axis `detailed_tokens` keeps apart in a token: 2 where the map is that fine, else 1."""
+    return 2 if count >= 2 * grid else 1
+
+
+def detailed_tokens(
+    features: Float[Tensor, "view channel cell cell"], grid: int
+) -> Float[Tensor, "view token token_channel"]:
+    """A map whose cells share out the side, on a grid x grid token grid, without blurring what is finer than it.
+
+    A map at least twice as fine as the grid is read at 2 x 2 places in each token, side by side in its channels:
+    outlines are finer than tokens.
+    """
+    count = features.shape[-1]
+    apart = cells_per_token(count, grid)
+    tokens = resampled_tokens(features, CellCentres.aligned(count), apart * grid)
+    if apart == 1:
+        return tokens
+    return patchify(tokens.transpose(1, 2).unflatten(2, (apart * grid, apart * grid)), apart)
 
 
 def _weights(centres: CellCentres, count: int, grid: int) -> Float[Tensor, "grid count"]:

@@ -6,7 +6,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-__all__ = ["intersection_over_union", "voxel_chamfer"]
+__all__ = ["intersection_over_union", "mean_shape", "voxel_chamfer"]
 
 
 def intersection_over_union(
@@ -17,6 +17,14 @@ def intersection_over_union(
     union = (a | b).sum(1)
     overlap = (a & b).sum(1)
     return torch.where(union > 0, overlap / union.clamp(min=1), torch.ones_like(overlap, dtype=torch.float32))
+
+
+def mean_shape(shapes: Bool[Tensor, "shape i j k"]) -> Bool[Tensor, "i j k"]:
+    """The best single guess for all `shapes`: their mean, cut where its mean IoU with them is highest."""
+    counts = shapes.sum(0)
+    guesses = [counts >= at_least for at_least in range(1, len(shapes) + 1)]
+    scores = [float(intersection_over_union(guess.expand_as(shapes), shapes).mean()) for guess in guesses]
+    return guesses[max(range(len(scores)), key=scores.__getitem__)]
 
 
 def voxel_chamfer(predicted: Bool[Tensor, "i j k"], truth: Bool[Tensor, "i j k"]) -> float:

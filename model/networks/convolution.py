@@ -4,7 +4,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-__all__ = ["ChannelLayerNorm", "Downsample3d", "ResidualBlock3d", "Upsample3d", "pixel_shuffle_3d"]
+__all__ = [
+    "ChannelLayerNorm",
+    "Downsample3d",
+    "ResidualBlock3d",
+    "Upsample3d",
+    "pixel_shuffle_3d",
+    "pixel_unshuffle_3d",
+]
 
 
 class ChannelLayerNorm(nn.Module):
@@ -62,6 +69,16 @@ def pixel_shuffle_3d(
     batch, channels, *size = x.shape
     x = x.reshape(batch, channels // factor**3, factor, factor, factor, *size)
     return x.permute(0, 1, 5, 2, 6, 3, 7, 4).reshape(batch, -1, *[factor * extent for extent in size])
+
+
+def pixel_unshuffle_3d(
+    x: Float[Tensor, "batch channel fine_i fine_j fine_k"], factor: int
+) -> Float[Tensor, "batch out i j k"]:
+    """The inverse of `pixel_shuffle_3d`; `factor` divides every axis."""
+    batch, channels, *size = x.shape
+    i, j, k = (extent // factor for extent in size)
+    x = x.reshape(batch, channels, i, factor, j, factor, k, factor)
+    return x.permute(0, 1, 3, 5, 7, 2, 4, 6).reshape(batch, channels * factor**3, i, j, k)
 
 
 class Upsample3d(nn.Module):

@@ -7,25 +7,7 @@ Per layer, from the same pair (y_j, x_i):
 
 where the blocks also hold the self-attention and MLP of a diffusion transformer (FORMATS 4.1).
 
-Values of `DualBranchConfig`:
-
-| field                          | paper | small | tiny |
-|--------------------------------|-------|-------|------|
-| geometry.latent_resolution     | 16    | 16    | 8    |
-| geometry.latent_channels       | 8     | 8     | 8    |
-| geometry.patch                 | 1     | 2     | 1    |
-| geometry.channels              | 1024  | 384   | 192  |
-| geometry.condition_channels    | 1024  | 384   | 192  |
-| geometry.blocks (M)            | 24    | 12    | 6    |
-| geometry.heads                 | 16    | 6     | 3    |
-| masks.feature_channels         | 1024  | 384   | 192  |
-| masks.grid                     | 37    | 16    | 8    |
-| masks.patch                    | 4     | 4     | 8    |
-| masks.channels                 | 1024  | 384   | 192  |
-| masks.blocks (P)               | 12    | 6     | 3    |
-| masks.heads                    | 16    | 6     | 3    |
-| mlp_ratio (both)               | 4     | 4     | 4    |
-| checkpoint_blocks              | true  | false | false|
+configs/model/paper.yaml has the values of the paper.
 """
 
 from dataclasses import dataclass

@@ -22,8 +22,8 @@ __all__ = ["GeometryBranch", "GeometryBranchConfig"]
 class GeometryBranchConfig:
     """Sizes. The latent grid is cut into patches of `patch` cells per axis; `blocks` is the paper's M.
 
-    `latent_rms`: root mean square of clean latents, for `preconditioned_velocity`; None when the network's
-    output is the velocity itself, as in published weights.
+    `preconditioned`: the head gives what `preconditioned_velocity` lacks, which small networks learn sooner;
+    false: the head gives the velocity itself, as in published weights.
     """
 
     latent_resolution: int
@@ -34,7 +34,7 @@ class GeometryBranchConfig:
     blocks: int
     heads: int
     mlp_ratio: int
-    latent_rms: float | None
+    preconditioned: bool
 
     def __post_init__(self) -> None:
         if self.channels % self.heads:
@@ -50,13 +50,6 @@ class GeometryBranchConfig:
                 f"patch {self.patch} does not divide latent_resolution {self.latent_resolution}",
                 expected="latent_resolution % patch == 0",
                 action="Change one of them.",
-            )
-        if self.latent_rms is not None and self.latent_rms <= 0:
-            raise ModelError(
-                "geometry branch",
-                f"latent_rms is {self.latent_rms}",
-                expected="a positive number, or null for published weights",
-                action="Use 1.",
             )
 
     @property
@@ -115,7 +108,5 @@ class GeometryBranch(nn.Module):
     ) -> Float[Tensor, "batch latent i j k"]:
         """Velocity of the latent from y_{M+1}."""
         patches = self.out_layer(layer_norm(tokens[:, 0], eps=1e-5))
-        output = unpatchify(patches, self.config.patch, self.config.latent_shape[1:])
-        if self.config.latent_rms is None:
-            return output
-        return preconditioned_velocity(x_t, output.to(x_t.dtype), t, clean_std=self.config.latent_rms)
+        output = unpatchify(patches, self.config.patch, self.config.latent_shape[1:]).to(x_t.dtype)
+        return preconditioned_velocity(x_t, output, t) if self.config.preconditioned else output

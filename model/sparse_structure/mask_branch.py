@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from model.errors import ModelError
-from model.flow import preconditioned_velocity
+from model.flow import binary_velocity
 from model.networks.embeddings import TimestepEmbedder, sincos_position_embedding
 from model.networks.patches import patchify, unpatchify
 from model.networks.transformer import ModulatedCrossBlock, initialise_transformer, layer_norm
@@ -94,9 +94,8 @@ class MaskBranch(nn.Module):
         masks_t: Float[Tensor, "batch view 1 m m"],
         t: Float[Tensor, " batch"],
     ) -> Float[Tensor, "batch view 1 m m"]:
-        """Velocity of every mask from x_{P+1}. Clean masks are -1 or 1, so their root mean square is 1."""
+        """Velocity of every mask: the head on x_{P+1} gives half the log-odds of object at every pixel."""
         patches = self.out_layer(layer_norm(tokens, eps=1e-5))
         side = self.config.mask_resolution
-        output = unpatchify(patches.flatten(0, 1), self.config.patch, (side, side))
-        output = output.unflatten(0, tokens.shape[:2]).to(masks_t.dtype)
-        return preconditioned_velocity(masks_t, output, t, clean_std=1.0)
+        half_log_odds = unpatchify(patches.flatten(0, 1), self.config.patch, (side, side))
+        return binary_velocity(masks_t, half_log_odds.unflatten(0, tokens.shape[:2]), t)

@@ -32,7 +32,9 @@ from model.sparse_structure.vae import StructureVae, occupancy_from_logits
 from model.training.draws import normal_like, uniform
 from model.training.task import Evaluation, Losses
 
-__all__ = ["StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
+FIGURES = ("voxel_iou", "mean_shape_iou", "chamfer", "mask_iou", "visible_iou")
+
+__all__ = ["FIGURES", "StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,6 +67,7 @@ class StageOneTask:
     hand_encoder: FeatureEncoder
     vae: StructureVae  # frozen
     config: StageOneConfig
+    mean_shape: Bool[Tensor, "64 64 64"]  # of the training objects: what a prediction has to beat
 
     @property
     def module(self) -> nn.Module:
@@ -134,8 +137,12 @@ class StageOneTask:
 
     @torch.no_grad()
     def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
-        """voxel_iou, chamfer (share of the cube's side), mask_iou against the amodal truth; fixed noise."""
-        figures: dict[str, list[float]] = {"voxel_iou": [], "chamfer": [], "mask_iou": [], "visible_iou": []}
+        """voxel_iou, chamfer (share of the cube's side), mask_iou against the amodal truth; fixed noise.
+
+        Beside them what they have to beat: mean_shape_iou, the mean training shape for every object, and
+        visible_iou, the true visible mask in place of the amodal one.
+        """
+        figures: dict[str, list[float]] = {name: [] for name in FIGURES}
         pictures: dict[str, np.ndarray] = {}
         generator = torch.Generator().manual_seed(0)
         for batch in batches:
@@ -143,6 +150,8 @@ class StageOneTask:
             amodal = batch.object_amodal.flatten(0, 1)
             masks = _full_size(found.masks, amodal.shape[-1]).flatten(0, 1) > 0
             figures["voxel_iou"] += intersection_over_union(found.occupancy, batch.occupancy).tolist()
+            mean_shape = self.mean_shape.to(batch.occupancy.device).expand_as(batch.occupancy)
+            figures["mean_shape_iou"] += intersection_over_union(mean_shape, batch.occupancy).tolist()
             figures["mask_iou"] += intersection_over_union(masks, amodal).tolist()
             figures["visible_iou"] += intersection_over_union(
                 batch.object_visible.flatten(0, 1), amodal
@@ -171,9 +180,9 @@ class _Velocity:
 def mask_targets(
     amodal: Bool[Tensor, "batch view size size"], resolution: int
 ) -> Float[Tensor, "batch view 1 m m"]:
-    """Clean masks: share of each cell that is covered, from -1 (none) to +1 (all)."""
+    """Clean masks: +1 where the object covers more than half of a cell, else -1 (`binary_velocity` needs no others)."""
     covered = functional.adaptive_avg_pool2d(amodal.float().flatten(0, 1)[:, None], resolution)
-    return (2.0 * covered - 1.0).unflatten(0, amodal.shape[:2])
+    return torch.where(covered > 0.5, 1.0, -1.0).unflatten(0, amodal.shape[:2])
 
 
 def _full_size(masks: Float[Tensor, "batch view m m"], size: int) -> Float[Tensor, "batch view size size"]:

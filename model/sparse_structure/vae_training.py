@@ -40,14 +40,15 @@ class VaeTask:
 
     network: StructureVae
     config: VaeConfig
+    turn: bool  # shapes in random orientations: for decoding what was never seen, slower to learn
 
     @property
     def module(self) -> nn.Module:
         return self.network
 
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
-        """Dice and KL of shapes in random orientations (FORMATS 4.1)."""
-        occupancy = turned(batch.occupancy, generators)
+        """Dice and KL (FORMATS 4.1)."""
+        occupancy = turned(batch.occupancy, generators) if self.turn else batch.occupancy
         shape = self.config.latent_shape(occupancy.shape[-1])
         noise = normal_like(torch.zeros(len(occupancy), *shape, device=occupancy.device), generators)
         losses = self.network(occupancy, noise)

@@ -1,158 +1,238 @@
-"""Published TRELLIS checkpoints (FORMATS 4.2) into our modules: every key is accounted for, or nothing is loaded.
+"""Published TRELLIS checkpoints (FORMATS 4.2) into our weight files: every key is accounted for, or nothing is written.
 
-Our modules carry TRELLIS's parameter names, so no renaming happens: a file fits exactly when names and shapes
-are equal. Time and sign need no conversion either: TRELLIS has t = 0 at data and velocity = noise - clean.
+Our modules carry TRELLIS's parameter names, so a key only gets a prefix, and a file fits exactly when names and
+shapes are equal. Time and sign need no conversion either: TRELLIS has t = 0 at data and velocity = noise - clean.
 """
 
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
+from importlib.resources import files
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from model.errors import ModelError
-from model.sparse_structure.dual_branch import DualBranchFlow
-from model.sparse_structure.vae import StructureDecoder, StructureEncoder
+from model.networks.embeddings import sincos_position_embedding
+from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
+from model.sparse_structure.vae import StructureDecoder, StructureEncoder, VaeConfig
+from model.weights.safetensors_file import KeyComparison, compare_keys, read_header, read_tensors, shapes_of
+from model.weights.weight_file import GEOMETRY, VAE, write_weight_file
 
 __all__ = [
-    "WeightReport",
-    "compare_weights",
-    "import_structure_decoder",
-    "import_structure_encoder",
-    "import_structure_flow",
-    "import_weights",
+    "ImportReport",
+    "ImportedFile",
+    "PublishedFiles",
+    "find_published",
+    "import_published",
+    "published_shapes",
 ]
+
+_EXPECTED = "the stage-1 files of TRELLIS-image-large/ckpts"
+_ACTION = "Download ss_flow_img_dit_L_16l8_fp16, ss_enc_conv3d_16l8_fp16 and ss_dec_conv3d_16l8_fp16 (.safetensors)."
 
 
 @dataclass(frozen=True, kw_only=True)
-class WeightReport:
-    """What became of every key of a file and of every tensor of a model.
+class _Network:
+    """One network of stage 1."""
 
-    `used` was copied; `missing` is in the module and not in the file; `unused` is in the file and not in the
-    module; `mismatched` is in both with other shapes; `new` lies outside the module that the file describes
-    (the mask branch and the fusion of stage 1) and keeps its initial value.
-    """
+    name: str  # in the manifest; published files begin with it
+    class_name: str  # in the JSON beside the file
+    prefix: str  # of its tensors in our files
 
-    source: Path
-    used: tuple[str, ...]
-    missing: tuple[str, ...]
-    unused: tuple[str, ...]
-    mismatched: tuple[str, ...]
+
+_FLOW = _Network(name="ss_flow_img_dit_L_16l8", class_name="SparseStructureFlowModel", prefix=GEOMETRY)
+_NETWORKS = (
+    _FLOW,
+    _Network(name="ss_enc_conv3d_16l8", class_name="SparseStructureEncoder", prefix=f"{VAE}encoder."),
+    _Network(name="ss_dec_conv3d_16l8", class_name="SparseStructureDecoder", prefix=f"{VAE}decoder."),
+)
+
+
+def published_shapes(name: str) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a published network, e.g. "ss_enc_conv3d_16l8"."""
+    manifest = json.loads((files("model.weights") / "data" / "trellis_ss.json").read_text("utf-8"))
+    return {key: tuple(shape) for key, shape in manifest[name].items()}
+
+
+@dataclass(frozen=True, kw_only=True)
+class PublishedFiles:
+    """What a source offers: the file of each network by its name, and files that are none of them."""
+
+    found: dict[str, Path]
+    ignored: tuple[Path, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedFile:
+    """What became of every key of a file. `new`: tensors beside the module, which keep their initial values."""
+
+    network: str
+    path: Path
+    keys: KeyComparison
     new: tuple[str, ...]
 
-    @property
-    def complete(self) -> bool:
-        """Whether the file fits the module exactly."""
-        return not (self.missing or self.unused or self.mismatched)
 
-    def lines(self) -> list[str]:
-        """One line per key, grouped: what `forehoi weights import` prints."""
-        groups = {
-            "used": self.used,
-            "missing": self.missing,
-            "unused": self.unused,
-            "mismatched": self.mismatched,
-            "new": self.new,
+@dataclass(frozen=True, kw_only=True)
+class ImportReport:
+    """What was imported. `ignored` are files of the source that belong to no network of stage 1."""
+
+    imported: tuple[ImportedFile, ...]
+    absent: tuple[str, ...]  # networks that the source does not have
+    ignored: tuple[Path, ...]
+    key_list: Path  # JSON: every key
+
+
+def find_published(source: Path) -> PublishedFiles:
+    """The stage-1 files in a folder (or its `ckpts`), or one such file. ModelError when there is none, or one twice."""
+    if source.is_file():
+        return PublishedFiles(found={_network_of_file(source).name: source}, ignored=())
+    if not source.is_dir():
+        raise ModelError(source, "there is no such file or folder", expected=_EXPECTED, action=_ACTION)
+    paths = sorted([*source.glob("*.safetensors"), *(source / "ckpts").glob("*.safetensors")])
+    found: dict[str, Path] = {}
+    ignored = []
+    for path in paths:
+        network = _network_by_name(path)
+        if network is None:
+            ignored.append(path)
+        elif network.name in found:
+            raise ModelError(
+                source,
+                f"holds {network.name} twice: {found[network.name].name} and {path.name}",
+                expected="one file of each network",
+                action="Keep one of them.",
+            )
+        else:
+            found[network.name] = path
+    if not found:
+        problem = f"holds none of the networks of stage 1 among {len(paths)} safetensors files"
+        raise ModelError(source, problem, expected=_EXPECTED, action=_ACTION)
+    return PublishedFiles(found=found, ignored=tuple(ignored))
+
+
+def import_published(source: Path, *, flow: DualBranchConfig, vae: VaeConfig, out: Path) -> ImportReport:
+    """Write the weight file `out`, and beside it `*.keys.json` with what became of every key.
+
+    The list is also written when a file does not fit; then ModelError, and no weight file.
+    """
+    published = find_published(source)
+    with torch.device("meta"):
+        dual = DualBranchFlow(flow)
+        modules = {
+            GEOMETRY: dual.geometry,
+            f"{VAE}encoder.": StructureEncoder(vae),
+            f"{VAE}decoder.": StructureDecoder(vae),
         }
-        return [f"{group:<10} {name}" for group, names in groups.items() for name in names]
+    networks = [network for network in _NETWORKS if network.name in published.found]
+    new = tuple(f"flow.{name}" for name in shapes_of(dual) if not name.startswith("geometry."))
+    imported = tuple(
+        _compared(
+            network, published.found[network.name], modules[network.prefix], new if network is _FLOW else ()
+        )
+        for network in networks
+    )
+    key_list = _write_key_list(out.with_suffix(".keys.json"), imported)
+    for network, file in zip(networks, imported):
+        _require_complete(network, file, key_list)
+    tensors: dict[str, Tensor] = {}
+    for network, file in zip(networks, imported):
+        tensors |= read_tensors(file.path, {name: network.prefix + name for name in file.keys.used})
+        if network is _FLOW:
+            _check_position_embedding(file.path, tensors[f"{GEOMETRY}pos_emb"], flow)
+    write_weight_file(out, tensors, sources={file.network: file.path.name for file in imported})
+    absent = tuple(network.name for network in _NETWORKS if network not in networks)
+    return ImportReport(imported=imported, absent=absent, ignored=published.ignored, key_list=key_list)
 
 
-def _shapes_of_file(path: Path) -> dict[str, tuple[int, ...]]:
-    """Names and shapes from the header alone; ModelError when it is no safetensors file."""
-    try:
-        with safe_open(str(path), framework="pt") as file:
-            return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        problem = "not found" if isinstance(error, FileNotFoundError) else str(error)
+def _network_by_name(path: Path) -> _Network | None:
+    return next((network for network in _NETWORKS if path.name.startswith(network.name)), None)
+
+
+def _network_of_file(path: Path) -> _Network:
+    """By its name, else by the JSON beside it."""
+    by_class = {network.class_name: network for network in _NETWORKS}
+    network = _network_by_name(path) or by_class.get(str(_description(path).get("name")))
+    if network is None:
         raise ModelError(
             path,
-            problem,
-            expected="a safetensors file of TRELLIS-image-large/ckpts",
-            action="Check the path.",
-        ) from error
+            "is not one of the networks of stage 1, by its name and by the JSON beside it",
+            expected=f"a name that begins with {', '.join(network.name for network in _NETWORKS)}",
+            action="Give the published file under its own name.",
+        )
+    return network
 
 
-def compare_weights(path: Path, module: nn.Module) -> WeightReport:
-    """What `import_weights` would do, without loading: `used` lists the tensors that would be copied."""
-    found = _shapes_of_file(path)
-    ours = {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
-    common = ours.keys() & found.keys()
-    return WeightReport(
-        source=path,
-        used=tuple(name for name in ours if name in common and ours[name] == found[name]),
-        missing=tuple(name for name in ours if name not in found),
-        unused=tuple(sorted(found.keys() - ours.keys())),
-        mismatched=tuple(
-            f"{name} {found[name]} in the file, {ours[name]} in the module"
-            for name in ours
-            if name in common and ours[name] != found[name]
-        ),
-        new=(),
+def _description(path: Path) -> dict[str, object]:
+    """The JSON that TRELLIS puts beside its files: class name and arguments; empty when there is none."""
+    json_path = path.with_suffix(".json")
+    if not json_path.is_file():
+        return {}
+    try:
+        content = json.loads(json_path.read_text("utf-8"))
+    except ValueError as error:
+        content, reason = None, str(error)
+    else:
+        reason = "no mapping"
+    if not isinstance(content, dict):
+        raise ModelError(
+            json_path,
+            f"cannot be read ({reason})",
+            expected="the JSON of the checkpoint",
+            action="Copy it again.",
+        )
+    return content
+
+
+def _compared(network: _Network, path: Path, module: nn.Module, new: tuple[str, ...]) -> ImportedFile:
+    class_name = _description(path).get("name", network.class_name)
+    if class_name != network.class_name:
+        raise ModelError(
+            path,
+            f"is a {class_name}, by the JSON beside it",
+            expected=f"{network.class_name} ({network.name})",
+            action="Give the published file under its own name.",
+        )
+    found = read_header(path, expected=_EXPECTED, action=_ACTION).shapes
+    keys = compare_keys(found, shapes_of(module))
+    return ImportedFile(network=network.name, path=path, keys=keys, new=new)
+
+
+def _require_complete(network: _Network, file: ImportedFile, key_list: Path) -> None:
+    if file.keys.complete:
+        return
+    found = read_header(file.path, expected=_EXPECTED, action=_ACTION).shapes
+    if found == published_shapes(network.name):
+        action = "The file is the published one: import it with configs/model/paper.yaml."
+    else:
+        action = f"Every key is in {key_list}; give the unmodified {network.name}_fp16.safetensors."
+    count = len(file.keys.used) + len(file.keys.missing) + len(file.keys.mismatched)
+    raise ModelError(
+        file.path,
+        file.keys.problem(),
+        expected=f"the {count} tensors of {network.name} in this configuration",
+        action=action,
     )
 
 
-def import_weights(path: Path, module: nn.Module) -> WeightReport:
-    """Copy every tensor of the file into the module, float16 to the module's own dtype.
-
-    ModelError, and an unchanged module, when a key is missing, unused or of another shape, or when the file's
-    position embedding is not ours (then its tokens lie in another order).
-    """
-    report = compare_weights(path, module)
-    if not report.complete:
-        first = next(iter((*report.missing, *report.unused, *report.mismatched)))
-        lengths = (len(report.missing), len(report.unused), len(report.mismatched))
-        counts = "{} keys missing, {} unused, {} of another shape".format(*lengths)
-        raise ModelError(
-            path,
-            f"{counts}, first {first}",
-            expected=f"the {len(module.state_dict())} tensors of {type(module).__name__}",
-            action="Use the `paper` config and the file made for this network, before adding LoRA.",
-        )
-    targets = module.state_dict()
-    with safe_open(str(path), framework="pt") as file, torch.no_grad():
-        _check_position_embedding(path, file.get_tensor("pos_emb") if "pos_emb" in targets else None, targets)
-        for name in report.used:
-            targets[name].copy_(file.get_tensor(name))
-    return report
+def _write_key_list(path: Path, imported: tuple[ImportedFile, ...]) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    content = {
+        file.network: {"file": str(file.path), **asdict(file.keys), "new": file.new} for file in imported
+    }
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    return path
 
 
-def _check_position_embedding(path: Path, published: Tensor | None, targets: dict[str, Tensor]) -> None:
-    if published is None:
-        return
-    error = float((published.float() - targets["pos_emb"].float().cpu()).abs().max())
-    # Sines and cosines in float16 are within 5e-4; another order or formula is off by about 1.
-    if not error < 2e-3:
+def _check_position_embedding(path: Path, published: Tensor, flow: DualBranchConfig) -> None:
+    geometry = flow.geometry
+    ours = sincos_position_embedding(geometry.latent_resolution // geometry.patch, 3, geometry.channels)
+    error = float((published.float() - ours).abs().max())
+    # Sines and cosines in float16 are within 5e-4, in bfloat16 4e-3; another order or formula is off by about 1.
+    if not error < 1e-2:
         raise ModelError(
             path,
             f"pos_emb differs by {error:.2g} from the sin-cos formula",
             expected="row-major tokens, TRELLIS's frequencies",
             action="Use an unmodified checkpoint.",
         )
-
-
-def import_structure_encoder(path: Path, encoder: StructureEncoder) -> WeightReport:
-    """ss_enc_conv3d_16l8_fp16.safetensors into the encoder of a `paper` VAE."""
-    return import_weights(path, encoder)
-
-
-def import_structure_decoder(path: Path, decoder: StructureDecoder) -> WeightReport:
-    """ss_dec_conv3d_16l8_fp16.safetensors into the decoder of a `paper` VAE."""
-    return import_weights(path, decoder)
-
-
-def import_structure_flow(path: Path, flow: DualBranchFlow) -> WeightReport:
-    """ss_flow_img_dit_L_16l8_fp16.safetensors into the geometry branch; the report lists what stays new.
-
-    Keys of `used`, `missing` and `unused` are the file's; keys of `new` are those of `flow`.
-    """
-    report = import_weights(path, flow.geometry)
-    new = tuple(name for name in flow.state_dict() if not name.startswith("geometry."))
-    return WeightReport(
-        source=report.source,
-        used=report.used,
-        missing=report.missing,
-        unused=report.unused,
-        mismatched=report.mismatched,
-        new=new,
-    )

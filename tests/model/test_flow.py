@@ -14,6 +14,7 @@ from model.flow import (
     LogitNormalTime,
     SamplerSettings,
     UniformTime,
+    binary_velocity,
     clean_from_velocity,
     euler_path,
     euler_sample,
@@ -72,22 +73,41 @@ def test_uniform_and_logit_normal_times_have_their_distributions() -> None:
     assert torch.isfinite(edge).all()
 
 
-@pytest.mark.parametrize("clean_std", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("time", [0.0, 0.1, 0.5, 0.9, 1.0])
-def test_preconditioning_leaves_a_unit_target_uncorrelated_with_the_input(
-    clean_std: float, time: float
-) -> None:
-    clean, noise = clean_std * _random(0, 1, 200_000), _random(1, 1, 200_000)
+def test_preconditioning_leaves_a_unit_target_uncorrelated_with_the_input(time: float) -> None:
+    clean, noise = _random(0, 1, 200_000), _random(1, 1, 200_000)
     t = torch.tensor([time], dtype=torch.float64)
     x_t, velocity = interpolate(clean, noise, t), velocity_target(clean, noise)
     zero = torch.zeros_like(x_t)
-    linear = preconditioned_velocity(x_t, zero, t, clean_std=clean_std)
-    scale = preconditioned_velocity(zero, torch.ones_like(x_t), t, clean_std=clean_std)
-    target = (velocity - linear) / scale
+    scale = preconditioned_velocity(zero, torch.ones_like(x_t), t)
+    target = (velocity - preconditioned_velocity(x_t, zero, t)) / scale
     assert float(target.square().mean()) == pytest.approx(1, abs=0.02)
     assert float((target * x_t).mean()) == pytest.approx(0, abs=0.02)
     if time == 1.0:
-        torch.testing.assert_close(target, -clean / clean_std)
+        torch.testing.assert_close(target, -clean)
+
+
+@pytest.mark.parametrize("time", [0.2, 0.5, 0.9, 1.0])
+def test_binary_velocity_is_the_conditional_mean(time: float) -> None:
+    """Against the mean of the true velocity over many draws that fall into one bin of x_t."""
+    half_log_odds = 0.4
+    generator = torch.Generator().manual_seed(0)
+    probability = 1 / (1 + math.exp(-2 * half_log_odds))
+    clean = 2.0 * (torch.rand(1, 400_000, generator=generator).double() < probability) - 1
+    noise, t = _random(1, 1, 400_000), torch.tensor([time], dtype=torch.float64)
+    x_t, target = interpolate(clean, noise, t), velocity_target(clean, noise)
+    velocity = binary_velocity(x_t, torch.full_like(x_t, half_log_odds), t)
+    for low in (-1.0, -0.1, 0.5):
+        inside = (x_t > low) & (x_t < low + 0.2)
+        assert float((velocity - target)[inside].mean()) == pytest.approx(0, abs=0.05)
+
+
+@pytest.mark.parametrize("time", [1e-3, 0.1, 0.7])
+def test_a_certain_mask_gives_the_true_velocity(time: float) -> None:
+    clean, noise, t = _random(0, 1, 64).sign().float(), _random(1, 1, 64).float(), torch.tensor([time])
+    velocity = binary_velocity(interpolate(clean, noise, t), 100 * clean, t)
+    torch.testing.assert_close(velocity, velocity_target(clean, noise), atol=1e-3, rtol=1e-3)
+    assert torch.isfinite(binary_velocity(clean, torch.zeros(1, 64), torch.zeros(1))).all()
 
 
 def test_joint_loss_is_eq_2_and_names_samples() -> None:

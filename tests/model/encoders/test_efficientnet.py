@@ -68,7 +68,7 @@ def test_the_weights_are_the_published_ones(encoder: EfficientNetEncoder) -> Non
 def test_shape_dtype_and_protocol(encoder: EfficientNetEncoder) -> None:
     assert isinstance(encoder, FeatureEncoder)
     tokens = encoder(torch.rand(2, 3, 3, 96, 96))
-    assert tokens.shape == (2, 3, 256, encoder.channels) == (2, 3, 256, 496)
+    assert tokens.shape == (2, 3, 256, encoder.channels) == (2, 3, 256, 568)
     assert tokens.dtype == torch.float32
     assert tokens.std() == pytest.approx(1, abs=0.02)
 
@@ -87,7 +87,7 @@ def test_frozen(encoder: EfficientNetEncoder) -> None:
     assert not any(module.training for module in encoder.network.modules())
 
 
-@pytest.mark.parametrize("channels", [slice(0, 24), slice(24, 64), slice(64, 176), slice(176, 496)])
+@pytest.mark.parametrize("channels", [slice(0, 96), slice(96, 136), slice(136, 248), slice(248, 568)])
 def test_a_spot_changes_the_tokens_around_it(channels: slice) -> None:
     """Each stride (4, 8, 16, 32) sees things where they are, on average over places."""
     encoder = load_efficientnet(EfficientNetConfig(image_size=224, grid=28))

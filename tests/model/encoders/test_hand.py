@@ -17,7 +17,7 @@ from model.training.task import Task
 from tests.model.encoders.drawn import blob_picture, hand_batch
 
 SMALL = HandNetConfig(image_size=64, widths=(8, 16, 16, 32), decoder=16)
-LOSS = HandLossConfig(joint_weight=1.0, side_weight=0.1, sigma_cells=1.0, color_jitter=0.0)
+LOSS = HandLossConfig(object_weight=1.0, joint_weight=1.0, side_weight=0.1, sigma_cells=1.0, color_jitter=0.0)
 
 
 def network(seed: int = 0) -> HandNet:
@@ -30,16 +30,20 @@ def exact_output(batch: Batch, cells: int) -> HandOutput:
     position = cells * batch.joints_px.flatten(0, 1) / batch.images.shape[-1]
     centres = torch.arange(cells) + 0.5
     per_axis = -0.5 * (centres - position[..., None]) ** 2
-    share = functional.adaptive_avg_pool2d(batch.hand_visible.flatten(0, 1).float()[:, None], cells)[:, 0]
+    hand, held = (
+        functional.adaptive_avg_pool2d(mask.flatten(0, 1).float()[:, None], cells)[:, 0]
+        for mask in (batch.hand_visible, batch.object_visible)
+    )
     return HandOutput(
-        mask_logits=20 * (2 * share - 1),
+        mask_logits=20 * (2 * hand - 1),
+        object_logits=20 * (2 * held - 1),
         joint_logits=per_axis[..., 1, :, None] + per_axis[..., 0, None, :],
         right_logit=20 * (2 * batch.is_right.float() - 1).repeat_interleave(batch.images.shape[1]),
     )
 
 
 def one_sample(batch: Batch, index: int) -> Batch:
-    return Batch(**{name: value[index : index + 1] for name, value in vars(batch).items()})
+    return batch.part(index, index + 1)
 
 
 class Oracle(torch.nn.Module):
@@ -64,7 +68,7 @@ def test_tokens_shape_protocol_and_frozenness(tmp_path: Path) -> None:
     assert isinstance(encoder, FeatureEncoder)
     images = torch.rand(2, 3, 3, 96, 96, requires_grad=True)
     tokens = encoder(images)
-    assert tokens.shape == (2, 3, 64, encoder.channels) == (2, 3, 64, 48)
+    assert tokens.shape == (2, 3, 64, encoder.channels) == (2, 3, 64, 4 * 16 + 32)
     assert not tokens.requires_grad
     assert not any(p.requires_grad for p in encoder.network.parameters())
     assert torch.equal(tokens, encoder(images))
@@ -149,13 +153,14 @@ def test_a_perfect_output_has_no_loss_and_full_marks() -> None:
     batch = hand_batch(3, 2, 64, seed=1)
     losses = hand_losses(exact_output(batch, 16), batch, LOSS)
     assert {name: tuple(loss.shape) for name, loss in losses.items()} == dict.fromkeys(
-        ("mask", "joints", "side"), (3,)
+        ("mask", "object", "joints", "side"), (3,)
     )
     assert float(losses["joints"].max()) < 1e-4
     assert float(losses["side"].max()) < 1e-6
     evaluation = HandTask(network=network(), config=LOSS).evaluate(Oracle(batch), [batch])
     assert evaluation.figures == {
         "hand_mask_iou": 1.0,
+        "held_object_iou": 1.0,
         "hand_side_accuracy": 1.0,
         "hand_pck5": 1.0,
         "hand_joint_error": pytest.approx(0, abs=0.3),
@@ -194,10 +199,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_samples() -> None:
     assert isinstance(task, Task)
     whole = hand_batch(4, 2, 64, seed=4)
     total = task.loss(whole, []).total
-    samples = [
-        Batch(**{k: (v[i : i + 1] if k != "ids" else (v[i],)) for k, v in vars(whole).items()})
-        for i in range(4)
-    ]
+    samples = [one_sample(whole, i) for i in range(4)]
     parts = torch.stack([task.loss(sample, []).total for sample in samples])
     torch.testing.assert_close(total, parts.mean())
 

@@ -5,7 +5,13 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from model.encoders.token_grid import CellCentres, resampled_tokens, resized
+from model.encoders.token_grid import (
+    CellCentres,
+    cells_per_token,
+    detailed_tokens,
+    resampled_tokens,
+    resized,
+)
 
 
 @given(
@@ -54,3 +60,14 @@ def test_resizing_keeps_range_and_leaves_the_right_size_alone(dtype: torch.dtype
     assert small.shape == (1, 3, 32, 32)
     assert small.dtype == dtype
     assert 0 <= float(small.min()) <= float(small.max()) <= 1
+
+
+def test_maps_finer_than_tokens_keep_their_cells_apart() -> None:
+    features = torch.arange(2 * 8 * 8.0).reshape(1, 2, 8, 8)
+    tokens = detailed_tokens(features, 4).unflatten(1, (4, 4))
+    assert cells_per_token(8, 4) == 2
+    assert tokens[0, 1, 2].tolist() == features[0, :, 2:4, 4:6].flatten().tolist()
+    assert cells_per_token(8, 5) == cells_per_token(4, 8) == 1
+    torch.testing.assert_close(
+        detailed_tokens(features, 5), resampled_tokens(features, CellCentres.aligned(8), 5)
+    )

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from model.evaluation.overlap import intersection_over_union, voxel_chamfer
+from model.evaluation.overlap import intersection_over_union, mean_shape, voxel_chamfer
 
 
 def cube(low: int, high: int, size: int = 16) -> torch.Tensor:
@@ -25,3 +25,13 @@ def test_chamfer_of_single_voxels_is_their_distance_in_cube_sides():
     assert voxel_chamfer(a, b) == pytest.approx(0.5)
     assert voxel_chamfer(a, a) == 0.0
     assert voxel_chamfer(a, torch.zeros_like(a)) == float("inf")
+
+
+def test_the_mean_shape_is_the_best_cut_through_the_mean() -> None:
+    shapes = torch.zeros(3, 4, 4, 4, dtype=torch.bool)
+    shapes[:, :2] = True  # common to all
+    shapes[0, 2] = shapes[1, 3] = True  # each of one shape alone
+    assert torch.equal(mean_shape(shapes), shapes[2])
+    assert torch.equal(mean_shape(shapes[:1]), shapes[0])
+    disjoint = torch.eye(3, dtype=torch.bool)[:, :, None, None].expand(3, 3, 2, 2)
+    assert mean_shape(disjoint).any()  # an empty guess would have no overlap at all

@@ -5,6 +5,8 @@ import math
 import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from model.networks.attention import CrossAttention, MultiHeadRMSNorm, SelfAttention
 from model.networks.convolution import (
@@ -13,6 +15,7 @@ from model.networks.convolution import (
     ResidualBlock3d,
     Upsample3d,
     pixel_shuffle_3d,
+    pixel_unshuffle_3d,
 )
 from model.networks.embeddings import TimestepEmbedder, sincos_position_embedding
 from model.networks.patches import patchify, unpatchify
@@ -152,3 +155,12 @@ def test_convolution_blocks() -> None:
     normed = ChannelLayerNorm(4)(x)
     expected = (x - x.mean(1, keepdim=True)) / (x.var(1, unbiased=False, keepdim=True) + 1e-5).sqrt()
     torch.testing.assert_close(normed, expected)
+
+
+@given(factor=st.integers(1, 3), seed=st.integers(0, 100))
+def test_pixel_unshuffle_undoes_pixel_shuffle(factor: int, seed: int) -> None:
+    generator = torch.Generator().manual_seed(seed)
+    fine = torch.randn(2, 3, 2 * factor, factor, 3 * factor, generator=generator)
+    coarse = pixel_unshuffle_3d(fine, factor)
+    assert coarse.shape == (2, 3 * factor**3, 2, 1, 3)
+    assert torch.equal(pixel_shuffle_3d(coarse, factor), fine)

@@ -28,8 +28,7 @@ PAPER = GeometryBranchConfig(
     condition_channels=1024,
     blocks=24,
     heads=16,
-    mlp_ratio=4,
-    latent_rms=None,
+    mlp_ratio=4, preconditioned=False,
 )
 SMALL = GeometryBranchConfig(
     latent_resolution=2,
@@ -39,8 +38,7 @@ SMALL = GeometryBranchConfig(
     condition_channels=10,
     blocks=2,
     heads=2,
-    mlp_ratio=2,
-    latent_rms=None,
+    mlp_ratio=2, preconditioned=False,
 )
 
 

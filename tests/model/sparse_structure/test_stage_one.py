@@ -36,18 +36,17 @@ class MeanColor:
 @pytest.fixture
 def task() -> StageOneTask:
     torch.manual_seed(0)
-    vae = VaeConfig(channels=(4, 4, 8, 8), latent_channels=4, residual_blocks=(1, 1, 1, 1), middle_blocks=1)
+    vae = VaeConfig(patch=1, channels=(4, 4, 8, 8), latent_channels=4, residual_blocks=(1, 1, 1, 1), middle_blocks=1)
     flow = DualBranchConfig(
         geometry=GeometryBranchConfig(
             latent_resolution=8,
             latent_channels=4,
             patch=2,
-            latent_rms=1.0,
             channels=32,
             condition_channels=32,
             blocks=2,
             heads=2,
-            mlp_ratio=2,
+            mlp_ratio=2, preconditioned=False,
         ),
         masks=MaskBranchConfig(
             feature_channels=16, grid=4, patch=4, channels=32, blocks=2, heads=2, mlp_ratio=2
@@ -72,6 +71,7 @@ def task() -> StageOneTask:
             guidance=Guidance(strength={"geometry": 1.0}, interval=(0.5, 1.0)),
             latent_scale=1.0,
         ),
+        mean_shape=torch.zeros(64, 64, 64, dtype=torch.bool),
     )
 
 
@@ -117,8 +117,7 @@ def test_the_loss_of_a_sample_does_not_depend_on_its_neighbours(task, batch):
 
 
 def one(batch: Batch, place: int) -> Batch:
-    fields = {name: value[place : place + 1] for name, value in vars(batch).items() if name != "ids"}
-    return Batch(**fields, ids=batch.ids[place : place + 1])
+    return batch.part(place, place + 1)
 
 
 def test_prediction_is_repeatable_and_has_the_sizes_of_its_inputs(task, batch):
@@ -136,12 +135,13 @@ def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
     assert evaluation.pictures["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
 
 
-def test_mask_targets_are_covered_shares(batch):
+def test_mask_targets_are_plus_one_where_more_than_half_is_covered(batch):
     targets = mask_targets(batch.object_amodal, 16)
     assert targets.shape == (3, 2, 1, 16, 16)
     assert targets[0, 0, 0, 5, 6] == 1.0
     assert targets[0, 0, 0, 0, 0] == -1.0
-    assert mask_targets(batch.object_amodal, 8)[0, 0, 0, 3, 2] == 0.0  # half of the cell's columns
+    assert mask_targets(batch.object_amodal, 8)[0, 0, 0, 3, 2] == -1.0  # half of the cell's columns
+    assert set(mask_targets(batch.object_amodal, 5).unique().tolist()) == {-1.0, 1.0}
 
 
 def test_turned_shapes_are_all_48_orientations_of_the_same_voxels():

@@ -15,7 +15,7 @@ from model.sparse_structure.vae import (
     vae_loss,
 )
 
-SMALL = VaeConfig(channels=(4, 8, 16), latent_channels=8, residual_blocks=(0, 1, 2), middle_blocks=1)
+SMALL = VaeConfig(patch=1, channels=(4, 8, 16), latent_channels=8, residual_blocks=(0, 1, 2), middle_blocks=1)
 
 
 def _sphere(resolution: int, radius: float) -> torch.Tensor:
@@ -24,10 +24,12 @@ def _sphere(resolution: int, radius: float) -> torch.Tensor:
     return (x**2 + y**2 + z**2 < radius**2)[None]
 
 
-@pytest.mark.parametrize(("channels", "latent"), [((4, 8, 16), 16), ((4, 4, 8, 8), 8)])
-def test_64_cubed_to_its_latent_and_back(channels: tuple[int, ...], latent: int) -> None:
+@pytest.mark.parametrize(
+    ("patch", "channels", "latent"), [(1, (4, 8, 16), 16), (1, (4, 4, 8, 8), 8), (2, (8, 16), 16), (4, (8, 8), 8)]
+)
+def test_64_cubed_to_its_latent_and_back(patch: int, channels: tuple[int, ...], latent: int) -> None:
     blocks = (0,) + (1,) * (len(channels) - 1)
-    config = VaeConfig(channels=channels, latent_channels=8, residual_blocks=blocks, middle_blocks=1)
+    config = VaeConfig(patch=patch, channels=channels, latent_channels=8, residual_blocks=blocks, middle_blocks=1)
     vae = StructureVae(config)
     assert config.latent_shape(64) == (8, latent, latent, latent)
     with torch.no_grad():
@@ -84,6 +86,6 @@ def test_bad_sizes_are_one_clear_line() -> None:
     with pytest.raises(ModelError, match="multiples of 4"):
         StructureVae(SMALL).encoder(torch.zeros(1, 10, 10, 10, dtype=torch.bool))
     with pytest.raises(ModelError, match="positive sizes"):
-        VaeConfig(channels=(), latent_channels=8, residual_blocks=(), middle_blocks=1)
+        VaeConfig(patch=1, channels=(), latent_channels=8, residual_blocks=(), middle_blocks=1)
     with pytest.raises(ModelError, match="for 2 levels"):
-        VaeConfig(channels=(4, 8), latent_channels=8, residual_blocks=(1,), middle_blocks=1)
+        VaeConfig(patch=1, channels=(4, 8), latent_channels=8, residual_blocks=(1,), middle_blocks=1)

@@ -5,198 +5,189 @@ from pathlib import Path
 
 import pytest
 import torch
-from safetensors.torch import save_file
-from torch import nn
+from safetensors.torch import load_file, save_file
 
+from model.config import load_config
 from model.errors import ModelError
-from model.networks.lora import LoraSettings, add_lora
-from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
-from model.sparse_structure.geometry_branch import GeometryBranchConfig
-from model.sparse_structure.mask_branch import MaskBranchConfig
-from model.sparse_structure.vae import StructureDecoder, StructureEncoder, VaeConfig
-from model.weights.trellis import (
-    compare_weights,
-    import_structure_decoder,
-    import_structure_encoder,
-    import_structure_flow,
+from model.sparse_structure.dual_branch import DualBranchFlow
+from model.weights.safetensors_file import shapes_of
+from model.weights.trellis import find_published, import_published, published_shapes
+from tests.model.weights.published import (
+    CLASSES,
+    DECODER,
+    ENCODER,
+    FLOW,
+    SMALL_FLOW,
+    SMALL_VAE,
+    modules,
+    write_published,
 )
 
 ROOT = Path(__file__).resolve().parents[3]
-MANIFEST = json.loads((ROOT / "model/weights/trellis_ss.json").read_text())
 RESEARCH = ROOT.parent / "shared/research/trellis_parameters.json"
-
-PAPER_VAE = VaeConfig(channels=(32, 128, 512), latent_channels=8, residual_blocks=(2, 2, 2), middle_blocks=2)
-SMALL_VAE = VaeConfig(channels=(4, 8), latent_channels=8, residual_blocks=(1, 1), middle_blocks=1)
-
-
-def _flow_config(
-    channels: int, blocks: int, mask_blocks: int, heads: int, resolution: int, grid: int
-) -> DualBranchConfig:
-    return DualBranchConfig(
-        geometry=GeometryBranchConfig(
-            latent_resolution=resolution,
-            latent_channels=8,
-            patch=1,
-            channels=channels,
-            condition_channels=channels,
-            blocks=blocks,
-            heads=heads,
-            mlp_ratio=4,
-            latent_rms=None,
-        ),
-        masks=MaskBranchConfig(
-            feature_channels=channels,
-            grid=grid,
-            patch=4,
-            channels=channels,
-            blocks=mask_blocks,
-            heads=heads,
-            mlp_ratio=4,
-        ),
-        checkpoint_blocks=False,
-    )
+PAPER = load_config(ROOT / "configs/model/paper.yaml")
+PREFIXES = {FLOW: "flow.geometry.", ENCODER: "vae.encoder.", DECODER: "vae.decoder."}
 
 
-PAPER_FLOW = _flow_config(1024, 24, 12, 16, 16, 37)
-SMALL_FLOW = _flow_config(16, 2, 1, 2, 2, 2)
+def run(source: Path, out: Path, flow=SMALL_FLOW, vae=SMALL_VAE):
+    return import_published(source, flow=flow, vae=vae, out=out)
 
 
-def _shapes(module: nn.Module) -> dict[str, list[int]]:
-    return {name: list(tensor.shape) for name, tensor in module.state_dict().items()}
-
-
-def _published(module: nn.Module, seed: int) -> dict[str, torch.Tensor]:
-    """A float16 checkpoint of the module's names and shapes with random values (the position embedding kept)."""
-    generator = torch.Generator().manual_seed(seed)
-    return {
-        name: (tensor if name == "pos_emb" else torch.randn(tensor.shape, generator=generator)).half()
-        for name, tensor in module.state_dict().items()
-    }
+def fails(source: Path, out: Path, *parts: str) -> str:
+    """One line that says all of `parts`, and no weight file."""
+    with pytest.raises(ModelError) as caught:
+        run(source, out)
+    text = str(caught.value)
+    assert "\n" not in text
+    assert all(part in text for part in parts), text
+    assert not out.exists()
+    return text
 
 
 def test_paper_config_has_the_published_names_and_shapes() -> None:
-    with torch.device("meta"):
-        modules = {
-            "ss_enc_conv3d_16l8": StructureEncoder(PAPER_VAE),
-            "ss_dec_conv3d_16l8": StructureDecoder(PAPER_VAE),
-            "ss_flow_img_dit_L_16l8": DualBranchFlow(PAPER_FLOW).geometry,
-        }
-    assert {name: _shapes(module) for name, module in modules.items()} == MANIFEST
+    for name, module in modules(PAPER.stage_one.network, PAPER.vae.network).items():
+        assert shapes_of(module) == published_shapes(name)
+
+
+def test_paper_config_has_the_published_number_of_parameters() -> None:
+    counts = {
+        name: sum(p.numel() for p in module.parameters())
+        for name, module in modules(PAPER.stage_one.network, PAPER.vae.network).items()
+    }
+    assert counts[FLOW] == pytest.approx(555e6, rel=2e-3)  # FORMATS 4.1
+    assert counts[FLOW] == sum(
+        int(torch.tensor(shape).prod()) for name, shape in published_shapes(FLOW).items() if name != "pos_emb"
+    )
 
 
 @pytest.mark.skipif(not RESEARCH.exists(), reason="the research notes are not part of the repository")
 def test_manifest_repeats_the_research_notes() -> None:
     research = json.loads(RESEARCH.read_text())
-    assert {name: research[name]["parameters"] for name in MANIFEST} == MANIFEST
+    for name in CLASSES:
+        noted = {key: tuple(shape) for key, shape in research[name]["parameters"].items()}
+        assert noted == published_shapes(name)
 
 
 def test_new_parameters_are_outside_the_geometry_branch() -> None:
     with torch.device("meta"):
-        flow = DualBranchFlow(PAPER_FLOW)
+        flow = DualBranchFlow(PAPER.stage_one.network)
     new = {name for name in flow.state_dict() if not name.startswith("geometry.")}
     assert {name.split(".")[0] for name in new} == {"masks", "fusion", "context"}
-    assert {name.split(".")[1] for name in new if name.startswith("masks.")} == {
-        "t_embedder",
-        "feature_layer",
-        "input_layer",
-        "blocks",
-        "out_layer",
-    }
 
 
-def test_vae_weights_are_copied(tmp_path: Path) -> None:
-    encoder, decoder = StructureEncoder(SMALL_VAE), StructureDecoder(SMALL_VAE)
-    for module, load in ((encoder, import_structure_encoder), (decoder, import_structure_decoder)):
-        published = _published(module, seed=1)
-        path = tmp_path / f"{type(module).__name__}.safetensors"
-        save_file(published, path)
-        report = load(path, module)
-        assert report.complete
-        assert set(report.used) == set(published)
-        for name, tensor in module.state_dict().items():
-            assert tensor.dtype == torch.float32
-            assert torch.equal(tensor, published[name].float())
+def test_a_folder_is_imported_bit_for_bit_and_every_key_listed(tmp_path: Path) -> None:
+    written = write_published(tmp_path / "TRELLIS" / "ckpts")
+    save_file({"x": torch.zeros(1)}, tmp_path / "TRELLIS/ckpts/slat_flow_img_dit_L_64l8p2_fp16.safetensors")
+    out = tmp_path / "weights" / "trellis.safetensors"
+    report = run(tmp_path / "TRELLIS", out)
+    found = load_file(out)
+    assert found.keys() == {PREFIXES[name] + key for name in written for key in written[name]}
+    for name, tensors in written.items():
+        for key, tensor in tensors.items():
+            assert torch.equal(found[PREFIXES[name] + key], tensor)
+            assert found[PREFIXES[name] + key].dtype == torch.float16
+    assert [path.name for path in report.ignored] == ["slat_flow_img_dit_L_64l8p2_fp16.safetensors"]
+    assert not report.absent
+    listed = json.loads(report.key_list.read_text())
+    assert report.key_list == tmp_path / "weights" / "trellis.keys.json"
+    for name, tensors in written.items():
+        assert set(listed[name]["used"]) == set(tensors)
+        assert listed[name]["missing"] == listed[name]["unused"] == listed[name]["mismatched"] == []
+    with torch.device("meta"):
+        rest = {
+            f"flow.{name}" for name in DualBranchFlow(SMALL_FLOW).state_dict() if not name.startswith("geom")
+        }
+    assert set(listed[FLOW]["new"]) == rest
 
 
-def test_flow_weights_are_copied_and_new_ones_listed(tmp_path: Path) -> None:
-    flow = DualBranchFlow(SMALL_FLOW)
-    new_before = {
-        name: tensor.clone() for name, tensor in flow.state_dict().items() if not name.startswith("geometry.")
-    }
-    published, path = _published(flow.geometry, seed=2), tmp_path / "flow.safetensors"
-    save_file(published, path)
-    report = import_structure_flow(path, flow)
-    assert set(report.used) == set(published)
-    assert set(report.new) == set(new_before)
-    for name, tensor in flow.state_dict().items():
-        expected = (
-            published[name.removeprefix("geometry.")].float()
-            if name.startswith("geometry.")
-            else new_before[name]
-        )
-        assert torch.equal(tensor, expected)
-    assert len(report.lines()) == len(flow.state_dict())
-    assert "used       blocks.0.self_attn.to_qkv.weight" in report.lines()
+def test_single_files_by_name_or_by_the_json_beside_them(tmp_path: Path) -> None:
+    write_published(tmp_path)
+    report = run(tmp_path / f"{DECODER}_fp16.safetensors", tmp_path / "a.safetensors")
+    assert set(report.absent) == {FLOW, ENCODER}
+    for suffix in ("safetensors", "json"):
+        (tmp_path / f"{ENCODER}_fp16.{suffix}").rename(tmp_path / f"mine.{suffix}")
+    assert find_published(tmp_path / "mine.safetensors").found == {ENCODER: tmp_path / "mine.safetensors"}
+    (tmp_path / "mine.json").unlink()
+    fails(tmp_path / "mine.safetensors", tmp_path / "b.safetensors", "is not one of the networks of stage 1")
 
 
-def test_header_of_the_full_flow_is_read_without_its_tensors(tmp_path: Path) -> None:
-    """All 489 keys of the published flow against the paper config; a sparse file stands in for 1.1 GB."""
+def test_a_key_too_few_too_many_or_of_another_shape_is_refused_and_listed(tmp_path: Path) -> None:
+    tensors = write_published(tmp_path / "in")[ENCODER]
+    del tensors["input_layer.bias"]
+    tensors |= {"extra": torch.zeros(1), "out_layer.2.bias": torch.zeros(2)}
+    save_file(tensors, tmp_path / "in" / f"{ENCODER}_fp16.safetensors")
+    fails(
+        tmp_path / "in",
+        tmp_path / "out.safetensors",
+        "1 keys missing, 1 unused, 1 of another shape",
+        "out_layer.2.bias (2,) in the file, (16,) in the module",
+        "out.keys.json",
+    )
+    listed = json.loads((tmp_path / "out.keys.json").read_text())[ENCODER]
+    assert (listed["missing"], listed["unused"]) == (["input_layer.bias"], ["extra"])
+
+
+def _sparse_published_file(path: Path, name: str) -> None:
+    """The published header before as many zeros as its tensors take (1.1 GB for the flow, none of it on the disk)."""
     header, offset = {}, 0
-    for name, shape in MANIFEST["ss_flow_img_dit_L_16l8"].items():
+    for key, shape in published_shapes(name).items():
         size = 2 * int(torch.tensor(shape).prod())
-        header[name] = {"dtype": "F16", "shape": shape, "data_offsets": [offset, offset + size]}
+        header[key] = {"dtype": "F16", "shape": shape, "data_offsets": [offset, offset + size]}
         offset += size
     text = json.dumps(header).encode()
-    path = tmp_path / "ss_flow_img_dit_L_16l8_fp16.safetensors"
     with path.open("wb") as file:
         file.write(len(text).to_bytes(8, "little") + text)
         file.truncate(8 + len(text) + offset)
-    with torch.device("meta"):
-        report = compare_weights(path, DualBranchFlow(PAPER_FLOW).geometry)
-    assert report.complete
-    assert len(report.used) == 489
 
 
-def test_a_key_too_few_too_many_or_of_another_shape_is_refused(tmp_path: Path) -> None:
-    encoder = StructureEncoder(SMALL_VAE)
-    before = {name: tensor.clone() for name, tensor in encoder.state_dict().items()}
-    published = _published(encoder, seed=3)
-    del published["input_layer.bias"]
-    published["extra"] = torch.zeros(1)
-    published["out_layer.2.bias"] = torch.zeros(2)
-    path = tmp_path / "encoder.safetensors"
-    save_file(published, path)
-    report = compare_weights(path, encoder)
-    assert (report.missing, report.unused) == (("input_layer.bias",), ("extra",))
-    assert report.mismatched == ("out_layer.2.bias (2,) in the file, (16,) in the module",)
-    with pytest.raises(ModelError, match="1 keys missing, 1 unused, 1 of another shape") as caught:
-        import_structure_encoder(path, encoder)
-    assert "\n" not in str(caught.value)
-    assert all(torch.equal(tensor, before[name]) for name, tensor in encoder.state_dict().items())
+def test_the_published_flow_fits_the_paper_config_and_no_other(tmp_path: Path) -> None:
+    path = tmp_path / f"{FLOW}_fp16.safetensors"
+    _sparse_published_file(path, FLOW)
+    fails(path, tmp_path / "out.safetensors", "import it with configs/model/paper.yaml")
+    with pytest.raises(ModelError, match="pos_emb differs by 1"):  # zeros: all 489 keys fit, and are read
+        run(path, tmp_path / "out.safetensors", PAPER.stage_one.network, PAPER.vae.network)
+    listed = json.loads((tmp_path / "out.keys.json").read_text())[FLOW]
+    assert len(listed["used"]) == 489
 
 
 def test_another_order_of_tokens_is_refused(tmp_path: Path) -> None:
-    flow, path = DualBranchFlow(SMALL_FLOW), tmp_path / "flow.safetensors"
-    published = _published(flow.geometry, seed=4)
-    published["pos_emb"] = published["pos_emb"].flip(0)
-    save_file(published, path)
-    with pytest.raises(ModelError, match="pos_emb differs"):
-        import_structure_flow(path, flow)
+    tensors = write_published(tmp_path)[FLOW]
+    tensors["pos_emb"] = tensors["pos_emb"].flip(0)
+    save_file(tensors, tmp_path / f"{FLOW}_fp16.safetensors")
+    fails(tmp_path, tmp_path / "out.safetensors", "pos_emb differs")
 
 
-def test_weights_go_in_before_lora(tmp_path: Path) -> None:
-    flow, path = DualBranchFlow(SMALL_FLOW), tmp_path / "flow.safetensors"
-    save_file(_published(flow.geometry, seed=5), path)
-    add_lora(flow.geometry, LoraSettings(rank=2, alpha=4, dropout=0.0))
-    with pytest.raises(ModelError, match="before adding LoRA"):
-        import_structure_flow(path, flow)
+def test_another_networks_file_is_refused(tmp_path: Path) -> None:
+    write_published(tmp_path)
+    path = tmp_path / f"{FLOW}_fp16.safetensors"
+    path.with_suffix(".json").write_text('{"name": "SLatFlowModel", "args": {}}')
+    fails(tmp_path, tmp_path / "out.safetensors", "is a SLatFlowModel")
+    path.with_suffix(".json").write_text("{")
+    fails(tmp_path, tmp_path / "out.safetensors", "cannot be read")
+    path.with_suffix(".json").unlink()
+    path.write_bytes((tmp_path / f"{DECODER}_fp16.safetensors").read_bytes())
+    fails(tmp_path, tmp_path / "out.safetensors", "keys missing", "unmodified ss_flow_img_dit_L_16l8_fp16")
 
 
-def test_files_that_are_not_checkpoints(tmp_path: Path) -> None:
-    encoder = StructureEncoder(SMALL_VAE)
-    with pytest.raises(ModelError, match="not found"):
-        import_structure_encoder(tmp_path / "none.safetensors", encoder)
-    torn = tmp_path / "torn.safetensors"
-    torn.write_bytes(b"0123456789")
-    with pytest.raises(ModelError, match="safetensors"):
-        import_structure_encoder(torn, encoder)
+def test_broken_files_are_one_line(tmp_path: Path) -> None:
+    tensors = write_published(tmp_path)[ENCODER]
+    path, out = tmp_path / f"{ENCODER}_fp16.safetensors", tmp_path / "out.safetensors"
+    whole = path.read_bytes()
+    for torn in (b"", whole[:5], whole[:100], whole[:-1], b"\xff" * 100, whole + b"x"):
+        path.write_bytes(torn)
+        fails(tmp_path, out, "is no complete safetensors file")
+    path.write_bytes(whole.replace(b'"F16"', b'"F61"', 1))
+    fails(tmp_path, out, "is no complete safetensors file")
+    save_file(tensors | {"input_layer.bias": torch.zeros(4, dtype=torch.int8)}, path)
+    fails(tmp_path, out, "stores input_layer.bias as I8 (1 such tensors)", "F16")
+    save_file(tensors | {"input_layer.bias": torch.full((4,), torch.nan)}, path)
+    fails(tmp_path, out, "input_layer.bias holds NaN")
+
+
+def test_sources_without_networks(tmp_path: Path) -> None:
+    out = tmp_path / "out.safetensors"
+    fails(tmp_path / "none", out, "there is no such file or folder")
+    fails(tmp_path, out, "none of the networks of stage 1", "Download")
+    write_published(tmp_path)
+    (tmp_path / f"{FLOW}_bf16.safetensors").write_bytes(b"")
+    fails(tmp_path, out, "twice")

@@ -1,0 +1,120 @@
+"""`forehoi weights`: published weights in, trained adapters out."""
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from model.cli_options import plain_errors
+from model.config import load_config
+from model.weights.merging import export_run_adapter, merge_run
+from model.weights.trellis import ImportReport, import_published
+
+__all__ = ["weights"]
+
+
+@click.group()
+def weights() -> None:
+    """Published weights into a training, trained adapters out of it.
+
+    \b
+    Example:
+      forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
+      forehoi weights merge runs/paper --out weights/paper.safetensors
+    """
+
+
+@weights.command("import")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option(
+    "--config",
+    "config_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("configs/model/paper.yaml"),
+    show_default=True,
+    help="Configuration whose networks the weights are for.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("weights/trellis.safetensors"),
+    show_default=True,
+    help="Weight file to write; the list of all keys goes beside it, as .keys.json.",
+)
+@plain_errors
+def import_weights(source: Path, config_path: Path, out: Path) -> None:
+    """Convert published TRELLIS weights of stage 1: SOURCE is a folder of them, or one file.
+
+    The file that is written is what `vae.weights` and `stage_one.start.weights` of a configuration name.
+
+    \b
+    Example:
+      forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
+    """
+    config = load_config(config_path)
+    report = import_published(source, flow=config.stage_one.network, vae=config.vae.network, out=out)
+    console = Console()
+    console.print(_table(report))
+    for path in report.ignored:
+        console.print(f"not of stage 1: {path}", soft_wrap=True)
+    for name in report.absent:
+        console.print(f"not in {source}: {name}", soft_wrap=True)
+    console.print(f"every key: {report.key_list}", soft_wrap=True)
+    console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+
+
+@weights.command()
+@click.argument("run", type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="Weight file to write."
+)
+@plain_errors
+def merge(run: Path, out: Path) -> None:
+    """Merge the adapters of a run into the weights that it started from; everything else it trained comes along.
+
+    \b
+    Example:
+      forehoi weights merge runs/paper --out weights/paper.safetensors
+    """
+    start = merge_run(run, out)
+    console = Console()
+    console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+    console.print(
+        f"to start from it: start: {{weights: {start.weights}, latent_scale: {start.latent_scale}}}",
+        soft_wrap=True,
+    )
+
+
+@weights.command("export-adapter")
+@click.argument("run", type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="Folder to write, as peft does.",
+)
+@plain_errors
+def export(run: Path, out: Path) -> None:
+    """Write the adapter of a run for the peft library: adapter_config.json and adapter_model.safetensors.
+
+    It adapts the geometry branch alone; mask branch, fusion and aggregator are in the run's checkpoint.
+
+    \b
+    Example:
+      forehoi weights export-adapter runs/paper --out adapters/paper
+    """
+    parameters = export_run_adapter(run, out)
+    Console().print(f"wrote {out} ({parameters:,} parameters)", soft_wrap=True)
+
+
+def _table(report: ImportReport) -> Table:
+    table = Table(title="keys of the published files", title_justify="left")
+    counts = ("used", "missing", "unused", "other shape", "new")
+    for column in ("network", "file", *counts):
+        table.add_column(column, justify="right" if column in counts else "left", overflow="fold")
+    for file in report.imported:
+        keys = file.keys
+        numbers = (keys.used, keys.missing, keys.unused, keys.mismatched, file.new)
+        table.add_row(file.network, file.path.name, *[str(len(names)) for names in numbers])
+    return table

@@ -1,0 +1,106 @@
+"""The configuration of stage 2: one complete YAML file, every key checked, beside the one of stage 1."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from model.config import EncodersConfig, Recipe, TrainingConfig, ValidationConfig
+from model.errors import ModelError
+from model.flow import LogitNormalTime, SamplerSettings, UniformTime
+from model.networks.lora import LoraSettings
+from model.stream_config import StreamConfig
+from model.structured_latent.features import FEATURE_CHANNELS
+from model.structured_latent.flow import SlatFlowConfig
+from model.structured_latent.latent import SlatVaeConfig
+from model.structured_latent.mesh_evaluation import MeshEvaluationConfig
+from model.structured_latent.surface_loss import SurfaceLossConfig
+from shards.settings import SettingsError, settings_from_dict
+
+__all__ = ["SlatFlowPart", "SlatTrainingConfig", "SlatVaePart", "load_any_config", "parse_any_config"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlatVaePart:
+    """The structured-latent VAE."""
+
+    network: SlatVaeConfig
+    loss: SurfaceLossConfig
+    recipe: Recipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlatFlowPart:
+    """The structured-latent flow and what conditions it.
+
+    `start`: a weight file to start from, null for random ones. `lora`: adapt the attention projections of the flow and
+    freeze the rest of it, null to train it whole; what is new in stage 2 always trains whole.
+    """
+
+    network: SlatFlowConfig
+    start: Path | None
+    lora: LoraSettings | None
+    hand_width: int  # of the aggregator (section 3.1)
+    hidden: int
+    drop_condition: float
+    time: UniformTime | LogitNormalTime
+    sampler: SamplerSettings
+    guidance_strength: float
+    guidance_interval: tuple[float, float]
+    recipe: Recipe
+
+    def __post_init__(self) -> None:
+        if self.lora is not None and self.start is None:
+            raise ValueError(
+                "lora adapts weights that are there, and start is null: expected a file to start from; "
+                "name one (`forehoi weights import`), or set lora to null"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlatTrainingConfig:
+    """Everything that `forehoi train` needs for stage 2. Recipes replace the sizes in `data`."""
+
+    name: str
+    data: StreamConfig
+    validation: ValidationConfig
+    encoders: EncodersConfig
+    meshes: MeshEvaluationConfig
+    slat_vae: SlatVaePart
+    slat_flow: SlatFlowPart
+
+    def __post_init__(self) -> None:
+        vae, flow = self.slat_vae.network, self.slat_flow.network
+        if vae.feature_channels != FEATURE_CHANNELS:
+            raise ValueError(
+                f"slat_vae.network.feature_channels is {vae.feature_channels}: expected {FEATURE_CHANNELS}, the "
+                "features of an object's own surface (model/structured_latent/features.py); shards hold no others"
+            )
+        if (vae.latent_channels, vae.resolution) != (flow.latent_channels, flow.resolution):
+            raise ValueError(
+                f"slat_flow.network takes {flow.latent_channels} channels at {flow.resolution}^3, the VAE makes "
+                f"{vae.latent_channels} at {vae.resolution}^3: expected the same"
+            )
+
+
+def parse_any_config(text: str, *, where: str) -> TrainingConfig | SlatTrainingConfig:
+    """A configuration of stage 1 or of stage 2 from YAML text: of stage 2 when it has its parts."""
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
+    of_stage_two = isinstance(data, dict) and bool(data.keys() & {"slat_vae", "slat_flow"})
+    return settings_from_dict(SlatTrainingConfig if of_stage_two else TrainingConfig, data, where=where)
+
+
+def load_any_config(path: Path) -> TrainingConfig | SlatTrainingConfig:
+    """Read a complete YAML file of either stage; SettingsError names file, key, expected and found."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        raise ModelError(
+            path, "does not exist", expected="a training configuration", action="See configs/model."
+        ) from error
+    except UnicodeDecodeError as error:
+        raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
+    return parse_any_config(text, where=str(path))

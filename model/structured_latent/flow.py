@@ -1,0 +1,148 @@
+"""SLat flow: a diffusion transformer over the latents of the occupied voxels, conditioned per view (section 3.3).
+
+With the values of slat_flow_img_dit_L_64l8p2 (resolution 64, latent 8, channels 1024, condition 1024, 24 blocks,
+16 heads, mlp 4, patch 2, io_channels (128,), pool_pseudo_count 1) names and shapes of its parameters are those.
+
+    x_t at R^3 -> two residual blocks per level of io_channels, the second after pooling by 2 -> blocks at (R / patch)^3
+        -> the residual blocks mirrored, each reading what its counterpart gave -> velocity at R^3
+"""
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from model.errors import ModelError
+from model.networks.embeddings import TimestepEmbedder
+from model.networks.sparse.blocks import SparseResBlock3d
+from model.networks.sparse.resampling import mean_pool, unpool
+from model.networks.sparse.tensor import SparseTensor
+from model.networks.sparse.transformer import ModulatedSparseCrossBlock, initialise_sparse_transformer
+from model.networks.transformer import layer_norm
+from model.structured_latent.latent import require_layout
+from model.structured_latent.trunk import embedded, scale_down
+
+__all__ = ["SlatFlow", "SlatFlowConfig"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SlatFlowConfig:
+    """Sizes. `patch` = 2 ** len(io_channels): each level of residual blocks halves the resolution.
+
+    `pool_pseudo_count`: 1 for weights that began as TRELLIS's, else 0 (`mean_pool`). `checkpoint_blocks`
+    recomputes each transformer block in the backward pass: less memory, more time.
+    """
+
+    resolution: int
+    latent_channels: int
+    channels: int
+    condition_channels: int
+    blocks: int
+    heads: int
+    mlp_ratio: int
+    patch: int
+    io_channels: tuple[int, ...]
+    pool_pseudo_count: int
+    checkpoint_blocks: bool
+
+    def __post_init__(self) -> None:
+        if self.channels % self.heads:
+            raise ModelError(
+                "slat flow",
+                f"{self.heads} heads do not divide {self.channels} channels",
+                expected="channels % heads == 0",
+                action="Change one of them.",
+            )
+        if self.patch != 2 ** len(self.io_channels) or self.resolution % self.patch:
+            raise ModelError(
+                "slat flow",
+                f"patch {self.patch}, io_channels {self.io_channels}, resolution {self.resolution}",
+                expected="patch == 2 ** len(io_channels), and it divides the resolution",
+                action="Give io_channels one width for each halving.",
+            )
+
+
+class SlatFlow(nn.Module):
+    """Velocity of noisy latents."""
+
+    def __init__(self, config: SlatFlowConfig) -> None:
+        super().__init__()
+        self.config = config
+        widths = (*config.io_channels, config.channels)
+        self.t_embedder = TimestepEmbedder(config.channels)
+        self.input_layer = nn.Linear(config.latent_channels, widths[0])
+        self.input_blocks = nn.ModuleList()
+        self.out_blocks = nn.ModuleList()
+        for fine, coarse in pairwise(widths):
+            self.input_blocks.append(SparseResBlock3d(fine, fine, config.channels))
+            self.input_blocks.append(SparseResBlock3d(fine, coarse, config.channels))
+        for coarse, fine in pairwise(reversed(widths)):
+            # Twice the width: what comes from the blocks beside what the mirrored input block gave.
+            self.out_blocks.append(SparseResBlock3d(2 * coarse, fine, config.channels))
+            self.out_blocks.append(SparseResBlock3d(2 * fine, fine, config.channels))
+        self.blocks = nn.ModuleList(
+            ModulatedSparseCrossBlock(
+                channels=config.channels,
+                context_channels=config.condition_channels,
+                heads=config.heads,
+                mlp_ratio=config.mlp_ratio,
+                window=None,
+            )
+            for _ in range(config.blocks)
+        )
+        self.out_layer = nn.Linear(widths[0], config.latent_channels)
+        initialise_sparse_transformer(self, t_embedder=self.t_embedder)
+        scale_down(self.out_layer)
+
+    def forward(
+        self,
+        x_t: SparseTensor,
+        t: Float[Tensor, " batch"],
+        contexts: Float[Tensor, "batch view token condition"],
+        weights: Float[Tensor, "batch view"],
+    ) -> SparseTensor:
+        """noise - clean on the grid of x_t; `weights` of a sample sum to one over its views (Eq. 1).
+
+        ModelError when a size does not fit the config.
+        """
+        self._check(x_t, contexts)
+        t_embedding = self.t_embedder(t)
+        h = x_t.map(self.input_layer)
+        skips: list[SparseTensor] = []
+        for level in range(len(self.config.io_channels)):
+            skips.append(self.input_blocks[2 * level](h if not skips else skips[-1], t_embedding))
+            pooled = mean_pool(skips[-1], 2, pseudo_count=self.config.pool_pseudo_count)
+            skips.append(self.input_blocks[2 * level + 1](pooled, t_embedding))
+        h = embedded(skips[-1] if skips else h, self.input_layer)
+        for block in self.blocks:
+            h = self._run(block, h, t_embedding, contexts, weights)
+        for i, block in enumerate(self.out_blocks):
+            h = _beside(h, skips.pop())
+            # The first block of a level reads the coarse grid and works on the fine one.
+            h = block(unpool(h, skips[-1].grid) if i % 2 == 0 else h, t_embedding)
+        return h.with_features(self.out_layer(layer_norm(h.features, eps=1e-5)))
+
+    def _run(self, block: nn.Module, h: SparseTensor, *condition: Tensor) -> SparseTensor:
+        if self.config.checkpoint_blocks and torch.is_grad_enabled():
+            # Nothing random inside a block (no dropout), so its RNG state need not be kept.
+            return checkpoint(block, h, *condition, use_reentrant=False, preserve_rng_state=False)
+        return block(h, *condition)
+
+    def _check(self, x_t: SparseTensor, contexts: Tensor) -> None:
+        config = self.config
+        require_layout("x_t", x_t, channels=config.latent_channels, resolution=config.resolution)
+        if contexts.shape[-1] != config.condition_channels:
+            raise ModelError(
+                "slat flow",
+                f"contexts of {contexts.shape[-1]} channels",
+                expected=f"{config.condition_channels}",
+                action="Match condition_channels to what makes the contexts.",
+            )
+
+
+def _beside(x: SparseTensor, y: SparseTensor) -> SparseTensor:
+    """Channels of both, on the grid they share."""
+    return x.with_features(torch.cat([x.features, y.features], dim=1))

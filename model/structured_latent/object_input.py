@@ -1,0 +1,72 @@
+"""Batches of voxel features for the SLat encoder, each object's computed once."""
+
+import hashlib
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from model.bounded_cache import BoundedCache
+from model.networks.sparse.grid import SparseGrid
+from model.networks.sparse.tensor import SparseTensor
+from model.sample import Batch, ObjectSurface, SurfaceBatch
+from model.structured_latent.features import VoxelFeatures, object_features
+
+__all__ = ["ObjectInput", "ObjectInputs", "object_surface"]
+
+_MAX_OBJECTS = 256  # mirrored ones count apart; an object takes about 1 MB
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectInput:
+    """What encoder and loss read of a batch."""
+
+    features: SparseTensor  # 16 channels on the active voxels
+    corner_distances: Float[Tensor, "voxel 8"]  # voxels, negative inside
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ObjectInputs:
+    """Makes them, and keeps the last objects, recognised by their content. Not shared between processes."""
+
+    _kept: BoundedCache[VoxelFeatures] = field(default_factory=lambda: BoundedCache(_MAX_OBJECTS), init=False)
+
+    def __call__(self, batch: Batch) -> ObjectInput:
+        """On the batch's device. ModelError where the batch comes without surfaces."""
+        truth = batch.true_surface
+        found = [
+            self._features(occupancy.cpu().numpy(), object_surface(truth, sample))
+            for sample, occupancy in enumerate(batch.occupancy)
+        ]
+        device = batch.occupancy.device
+        rows = torch.from_numpy(np.concatenate([features.rows() for features in found]))
+        distances = torch.from_numpy(np.concatenate([features.distances for features in found]))
+        return ObjectInput(
+            features=SparseTensor(grid=SparseGrid.from_occupancy(batch.occupancy), features=rows.to(device)),
+            corner_distances=distances.to(device),
+        )
+
+    def _features(self, occupancy: Bool[np.ndarray, "i j k"], surface: ObjectSurface) -> VoxelFeatures:
+        digest = hashlib.blake2b(np.packbits(occupancy).tobytes(), digest_size=16)
+        for samples in (surface.points, surface.normals, surface.colors, surface.sdf_points, surface.sdf_values):
+            digest.update(np.ascontiguousarray(samples).data)
+        return self._kept.get(
+            digest.digest(),
+            lambda: object_features(surface, np.argwhere(occupancy), occupancy.shape[0]),
+            lambda _: 1,
+        )
+
+
+def object_surface(truth: SurfaceBatch, sample: int) -> ObjectSurface:
+    """The surface of one sample of a batch."""
+    part = truth.part(sample, sample + 1)
+    return ObjectSurface(
+        points=part.points.cpu().numpy(),
+        normals=part.normals.cpu().numpy(),
+        colors=part.colors.cpu().numpy(),
+        sdf_points=part.sdf_points.cpu().numpy(),
+        sdf_values=part.sdf_values.cpu().numpy(),
+        object_scale_m=part.object_scales_m[0],
+    )

@@ -1,0 +1,126 @@
+"""Training one part of a configuration: its streams, the trainer, its figures.
+
+RUN/<part>    checkpoints, TensorBoard logs, figures.json
+"""
+
+import json
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from pathlib import Path
+
+import torch
+from accelerate import Accelerator
+from torch import nn
+
+from model.config import Recipe, ValidationConfig
+from model.data import ShardStream, open_motions, validation_config
+from model.errors import ModelError
+from model.sample import Batch
+from model.stream_config import StreamConfig
+from model.training.checkpoint import latest_checkpoint, load_average
+from model.training.source import StreamSource
+from model.training.task import Evaluation, Task
+from model.training.trainer import StepReport, train
+
+__all__ = ["PartData", "load_part", "part_data", "run_part"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartData:
+    """Streams of one part."""
+
+    training: StreamSource
+    held_out: StreamConfig
+    batches: int
+
+    def validation(self, device: torch.device) -> Iterator[Batch]:
+        """The same held-out views every time."""
+        stream = ShardStream(self.held_out)
+        try:
+            for batch in islice(stream, self.batches):
+                yield batch.to(device, torch.float32)
+        finally:
+            stream.close()
+
+
+def part_data(
+    data: StreamConfig, validation: ValidationConfig, recipe: Recipe, accelerator: Accelerator
+) -> PartData:
+    """Streams with the sizes of `recipe`. Raises ModelError, ShardError."""
+    stream = replace(data, batch_size=recipe.batch_size, views=recipe.views, image_size=recipe.image_size)
+    held_out = validation_config(
+        stream,
+        split=validation.split,
+        cameras="held_out" if validation.split == stream.split else "all",
+        views=validation.views,
+        batch_size=validation.batch_size,
+    )
+    return PartData(
+        training=StreamSource(
+            config=stream,
+            index=open_motions(stream),
+            rank=accelerator.process_index,
+            ranks=accelerator.num_processes,
+        ),
+        held_out=replace(held_out, workers=0, samples_per_motion=validation.samples_per_motion),
+        batches=validation.batches,
+    )
+
+
+def run_part(
+    task: Task,
+    data: PartData,
+    recipe: Recipe,
+    folder: Path,
+    *,
+    config_yaml: str,
+    config_sha256: str,
+    accelerator: Accelerator,
+    report: Callable[[StepReport], None],
+) -> dict[str, float]:
+    """Train to the end, from where it was stopped, and give the figures of the last validation."""
+    last: list[Evaluation] = []
+
+    def validate() -> Evaluation:
+        last[:] = [task.evaluate(task.module, data.validation(accelerator.device))]
+        return last[0]
+
+    train(
+        task,
+        data.training,
+        recipe.trainer,
+        recipe.optimizer,
+        folder=folder,
+        config_yaml=config_yaml,
+        config_sha256=config_sha256,
+        validate=validate,
+        report=report,
+        accelerator=accelerator,
+    )
+    path = folder / "figures.json"
+    if last and accelerator.is_main_process:
+        path.write_text(json.dumps(last[0].figures, indent=2), encoding="utf-8")
+    accelerator.wait_for_everyone()
+    figures: dict[str, float] = json.loads(path.read_text(encoding="utf-8"))
+    return figures
+
+
+def load_part(folder: Path, module: nn.Module, *, config_sha256: str) -> None:
+    """Averaged weights of a trained part. ModelError when it is missing or of another configuration."""
+    path = latest_checkpoint(folder / "checkpoints")
+    if path is None:
+        raise ModelError(
+            folder,
+            "holds no checkpoint",
+            expected=f"the trained {folder.name}",
+            action=f"Train it first: forehoi train {folder.name}.",
+        )
+    state = load_average(path, module)
+    if state.config_sha256 != config_sha256:
+        raise ModelError(
+            path,
+            f"was trained with another configuration ({state.config_sha256[:12]})",
+            expected=f"configuration {config_sha256[:12]}",
+            action=f"Train the {folder.name} of this configuration into another folder (--out).",
+        )

@@ -1,0 +1,199 @@
+"""The parts of stage 2, trained one after the other: structured-latent VAE, structured-latent flow.
+
+RUN/slat_vae, RUN/slat_flow    checkpoints, TensorBoard logs, figures.json
+"""
+
+import hashlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from accelerate import Accelerator
+
+from model.config import EncodersConfig, OwnHandEncoder, PackagedHandEncoder, as_yaml
+from model.data import ShardStream
+from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
+from model.encoders.cached import CachedEncoder
+from model.encoders.dino import DinoConfig, load_dino
+from model.encoders.efficientnet import load_efficientnet
+from model.encoders.hand import HandEncoder, packaged_hand_net
+from model.encoders.protocol import FeatureEncoder
+from model.encoders.wilor import load_wilor
+from model.errors import ModelError
+from model.flow import Guidance
+from model.networks.lora import add_lora
+from model.networks.sparse.tensor import SparseTensor
+from model.sample import Batch
+from model.slat_config import SlatTrainingConfig
+from model.structured_latent.flow import SlatFlow
+from model.structured_latent.flow_training import LATENT, SlatFlowTask, SlatFlowTraining
+from model.structured_latent.latent import LatentNormalisation
+from model.structured_latent.object_input import ObjectInputs
+from model.structured_latent.vae_training import SlatVae, SlatVaeTask
+from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
+from model.training.part_run import load_part, part_data, run_part
+from model.training.task import Task
+from model.training.trainer import StepReport
+from model.weights.slat import load_stage_two_start
+from model.weights.weight_file import weights_sha256
+
+__all__ = ["SLAT_PARTS", "load_slat_flow", "slat_part_sha256", "train_slat_part"]
+
+SLAT_VAE, SLAT_FLOW = "slat_vae", "slat_flow"
+SLAT_PARTS = (SLAT_VAE, SLAT_FLOW)
+
+
+def train_slat_part(
+    name: str,
+    config: SlatTrainingConfig,
+    folder: Path,
+    *,
+    accelerator: Accelerator,
+    report: Callable[[StepReport], None],
+) -> dict[str, float]:
+    """Train one part (see SLAT_PARTS) and give its figures on held-out views. The VAE comes first.
+
+    Continues where it was stopped. ModelError when the VAE is missing or of another configuration.
+    """
+    recipe = config.slat_vae.recipe if name == SLAT_VAE else config.slat_flow.recipe
+    data = part_data(replace(config.data, surface=True), config.validation, recipe, accelerator)
+    torch.manual_seed(recipe.trainer.seed)  # of the initial weights
+    task: Task = (
+        _vae_task(config) if name == SLAT_VAE else _flow_task(config, folder, accelerator.device)
+    )
+    return run_part(
+        task,
+        data,
+        recipe,
+        folder / name,
+        config_yaml=as_yaml(config),
+        config_sha256=slat_part_sha256(name, config),
+        accelerator=accelerator,
+        report=report,
+    )
+
+
+def load_slat_flow(config: SlatTrainingConfig, folder: Path, device: torch.device) -> SlatFlowTask:
+    """Stage 2 with the averaged weights of its newest checkpoint, for inference: `.predict`."""
+    vae = _trained_vae(config, folder, device)
+    # The checkpoint brings the normalisation that the flow was trained with.
+    identity = LatentNormalisation.identity(config.slat_flow.network.latent_channels)
+    task = _assembled(config, vae, identity, device)
+    load_part(folder / SLAT_FLOW, task.module, config_sha256=slat_part_sha256(SLAT_FLOW, config))
+    task.module.to(device).eval()
+    return task
+
+
+def slat_part_sha256(name: str, config: SlatTrainingConfig) -> str:
+    """Changes with anything that decides what training a part gives. ModelError when a weight file is missing."""
+    texts = [as_yaml(config.slat_vae), as_yaml(config.data)]
+    if name == SLAT_FLOW:
+        texts += [as_yaml(config.slat_flow), as_yaml(config.encoders)]
+        texts += [weights_sha256(config.slat_flow.start)] if config.slat_flow.start is not None else []
+    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+
+
+def _vae_task(config: SlatTrainingConfig) -> SlatVaeTask:
+    part = config.slat_vae
+    return SlatVaeTask(network=SlatVae(part.network), loss_config=part.loss, evaluation=config.meshes)
+
+
+def _flow_task(config: SlatTrainingConfig, folder: Path, device: torch.device) -> SlatFlowTask:
+    vae = _trained_vae(config, folder, device)
+    normalisation = LatentNormalisation.measured(_training_latents(config, vae, device))
+    task = _assembled(config, vae, normalisation, device)
+    part = config.slat_flow
+    if part.start is not None:
+        load_stage_two_start(part.start, task.network)
+    if part.lora is not None:
+        add_lora(task.network.flow, part.lora)
+    return task
+
+
+def _assembled(
+    config: SlatTrainingConfig, vae: SlatVae, normalisation: LatentNormalisation, device: torch.device
+) -> SlatFlowTask:
+    part = config.slat_flow
+    image, hand = _encoders(config.encoders)
+    image.to(device, torch.float32)
+    hand.to(device, torch.float32)
+    aggregator = FeatureAggregator(
+        AggregatorConfig(
+            image_channels=image.channels,
+            image_grid=image.grid,
+            hand_channels=hand.channels,
+            hand_grid=hand.grid,
+            hand_width=part.hand_width,
+            hidden=part.hidden,
+            channels=part.network.condition_channels,
+        )
+    )
+    return SlatFlowTask(
+        network=ViewConditionedSlatFlow(aggregator, SlatFlow(part.network), normalisation),
+        image_encoder=image,
+        hand_encoder=hand,
+        vae=vae,
+        config=SlatFlowTraining(
+            drop_condition=part.drop_condition,
+            time=part.time,
+            sampler=part.sampler,
+            guidance=Guidance(strength={LATENT: part.guidance_strength}, interval=part.guidance_interval),
+        ),
+        evaluation=config.meshes,
+    )
+
+
+def _trained_vae(config: SlatTrainingConfig, folder: Path, device: torch.device) -> SlatVae:
+    """The frozen VAE."""
+    vae = SlatVae(config.slat_vae.network)
+    load_part(folder / SLAT_VAE, vae, config_sha256=slat_part_sha256(SLAT_VAE, config))
+    return vae.to(device).eval().requires_grad_(False)
+
+
+@torch.no_grad()
+def _training_latents(
+    config: SlatTrainingConfig, vae: SlatVae, device: torch.device
+) -> Iterator[SparseTensor]:
+    """Mean latents of the training objects, each once."""
+    stream = replace(
+        config.data,
+        surface=True,
+        batch_size=1,
+        views=(1, 1),
+        image_size=32,
+        endless=False,
+        workers=0,
+        samples_per_motion=1,
+    )
+    inputs, seen = ObjectInputs(), set[str]()
+    for batch in ShardStream(stream):
+        on_device: Batch = batch.to(device, torch.float32)
+        if (uid := on_device.true_surface.object_uids[0]) not in seen:
+            seen.add(uid)
+            yield vae.encoder(inputs(on_device).features).mean
+
+
+def _encoders(config: EncodersConfig) -> tuple[FeatureEncoder, FeatureEncoder]:
+    """The frozen encoders of pictures and hands."""
+    image: FeatureEncoder = (
+        load_dino(config.image) if isinstance(config.image, DinoConfig) else load_efficientnet(config.image)
+    )
+    if isinstance(config.hand, OwnHandEncoder):
+        raise ModelError(
+            "encoders.hand",
+            "is the hand encoder that stage 1 trains",
+            expected="one that is there already: {packaged_grid: N}, or WiLoR",
+            action="Change it; stage 2 trains no hand encoder.",
+        )
+    hand: FeatureEncoder = (
+        HandEncoder(network=packaged_hand_net(), grid=config.hand.packaged_grid)
+        if isinstance(config.hand, PackagedHandEncoder)
+        else load_wilor(config.hand)
+    )
+    if config.cached_views:
+        return (
+            CachedEncoder(encoder=image, max_views=config.cached_views),
+            CachedEncoder(encoder=hand, max_views=config.cached_views),
+        )
+    return image, hand

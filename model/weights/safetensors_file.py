@@ -1,0 +1,110 @@
+"""Reading safetensors files of unknown origin: header first, tensors when they are known to fit."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+
+from model.errors import ModelError
+
+__all__ = ["Header", "KeyComparison", "compare_keys", "read_header", "read_tensors", "shapes_of"]
+
+_FLOATS = ("F32", "F16", "BF16")
+
+Shapes = Mapping[str, tuple[int, ...]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Header:
+    """What a file holds, without its tensors."""
+
+    shapes: dict[str, tuple[int, ...]]
+    metadata: dict[str, str]
+
+
+@dataclass(frozen=True, kw_only=True)
+class KeyComparison:
+    """Keys of a file against the tensors of a module.
+
+    `used` fit; `missing` are in the module only; `unused` are in the file only; `mismatched` are in both with other
+    shapes, and say which.
+    """
+
+    used: tuple[str, ...]
+    missing: tuple[str, ...]
+    unused: tuple[str, ...]
+    mismatched: tuple[str, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether the file fits the module exactly."""
+        return not (self.missing or self.unused or self.mismatched)
+
+    def problem(self) -> str:
+        """What does not fit, in one line."""
+        lengths = (len(self.missing), len(self.unused), len(self.mismatched))
+        first = next(iter((*self.mismatched, *self.missing, *self.unused)))
+        return "{} keys missing, {} unused, {} of another shape, first ".format(*lengths) + first
+
+
+def shapes_of(module: nn.Module) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of what a module saves."""
+    return {name: tuple(tensor.shape) for name, tensor in module.state_dict().items()}
+
+
+def compare_keys(found: Shapes, wanted: Shapes) -> KeyComparison:
+    """Names and shapes of a file against those of a module."""
+    common = wanted.keys() & found.keys()
+    return KeyComparison(
+        used=tuple(name for name in wanted if name in common and wanted[name] == found[name]),
+        missing=tuple(name for name in wanted if name not in found),
+        unused=tuple(sorted(found.keys() - wanted.keys())),
+        mismatched=tuple(
+            f"{name} {found[name]} in the file, {wanted[name]} in the module"
+            for name in wanted
+            if name in common and wanted[name] != found[name]
+        ),
+    )
+
+
+def read_header(path: Path, *, expected: str, action: str) -> Header:
+    """Names, shapes and metadata. ModelError when the file is missing, torn, or holds anything but floats."""
+    if not path.is_file():
+        raise ModelError(path, "there is no such file", expected=expected, action=action)
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
+            shapes = {name: tuple(part.get_shape()) for name, part in slices.items()}
+            dtypes = {name: part.get_dtype() for name, part in slices.items()}
+            metadata = file.metadata() or {}
+    except (OSError, SafetensorError) as error:
+        reason = " ".join(str(error).split())
+        raise ModelError(
+            path, f"is no complete safetensors file ({reason})", expected=expected, action=action
+        ) from error
+    if odd := [f"{name} as {dtype}" for name, dtype in dtypes.items() if dtype not in _FLOATS]:
+        raise ModelError(
+            path,
+            f"stores {odd[0]} ({len(odd)} such tensors)",
+            expected=f"floating-point weights ({', '.join(_FLOATS)})",
+            action="Quantised weights cannot be trained: use the original file.",
+        )
+    return Header(shapes=shapes, metadata=metadata)
+
+
+def read_tensors(path: Path, names: Mapping[str, str]) -> dict[str, Tensor]:
+    """Tensors of the file as stored, renamed: `names` gives the new name of each. ModelError when one is not finite."""
+    with safe_open(str(path), framework="pt") as file:
+        tensors = {new: file.get_tensor(name) for name, new in names.items()}
+    for name, tensor in tensors.items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise ModelError(
+                path,
+                f"{name} holds NaN or infinity",
+                expected="finite weights",
+                action="The file is damaged: copy it again.",
+            )
+    return tensors

@@ -1,0 +1,195 @@
+"""The structured-latent networks of TRELLIS-image-large (FORMATS 4.2), as weights of stage 2.
+
+Groups in our weight files, of which any may be absent:
+
+    stage_two.flow.*                                 slat_flow_img_dit_L_64l8p2
+    stage_two.normalisation.*                        of the latents that it was trained on
+    stage_two.context.* stage_two.fusion.*           the rest of stage 2, of our own trainings
+    slat_vae.encoder.* slat_vae.surface.*            slat_enc_swin8_B_64l8, slat_dec_mesh_swin8_B_64l8m256c
+    slat_vae.gaussians.*                             slat_dec_gs_swin8_B_64l8gs32
+
+slat_dec_rf_swin8_B_64l8r16, the radiance-field decoder, has no use here.
+"""
+
+import json
+from importlib.resources import files
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from model.errors import ModelError
+from model.networks.sparse.convolution import pointwise_from_spconv
+from model.sparse_structure.fusion import ViewFusion
+from model.structured_latent.decoder import GaussianDecoder, SurfaceDecoder
+from model.structured_latent.encoder import SlatEncoder
+from model.structured_latent.flow import SlatFlow, SlatFlowConfig
+from model.structured_latent.gaussians import offset_perturbation
+from model.structured_latent.latent import LatentNormalisation, SlatVaeConfig
+from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
+from model.weights.published import PublishedNetwork
+from model.weights.safetensors_file import read_header
+from model.weights.weight_file import load_weights
+
+__all__ = [
+    "GAUSSIANS",
+    "SLAT_ENCODER",
+    "SLAT_FLOW",
+    "SURFACE",
+    "load_stage_two_start",
+    "published_slat_shapes",
+    "slat_networks",
+    "trellis_normalisation",
+]
+
+STAGE_TWO = "stage_two."
+SLAT_FLOW = f"{STAGE_TWO}flow."
+SLAT_ENCODER, SURFACE, GAUSSIANS = "slat_vae.encoder.", "slat_vae.surface.", "slat_vae.gaussians."
+
+_WHERE = "slat weights"
+_NETWORKS = {
+    "flow": ("slat_flow_img_dit_L_64l8p2", ("SLatFlowModel", "ElasticSLatFlowModel")),
+    "encoder": ("slat_enc_swin8_B_64l8", ("SLatEncoder", "ElasticSLatEncoder")),
+    "surface": ("slat_dec_mesh_swin8_B_64l8m256c", ("SLatMeshDecoder", "ElasticSLatMeshDecoder")),
+    "gaussians": ("slat_dec_gs_swin8_B_64l8gs32", ("SLatGaussianDecoder", "ElasticSLatGaussianDecoder")),
+}
+# `slat_normalization` of the pipeline.json of TRELLIS-image-large.
+_MEAN = (
+    -2.1687545776367188,
+    -0.004347046371549368,
+    -0.13352349400520325,
+    -0.08418072760105133,
+    -0.5271206498146057,
+    0.7238689064979553,
+    -1.1414450407028198,
+    1.2039363384246826,
+)
+_STD = (
+    2.377650737762451,
+    2.386378288269043,
+    2.124418020248413,
+    2.1748552322387695,
+    2.663944721221924,
+    2.371192216873169,
+    2.6217446327209473,
+    2.684523105621338,
+)
+
+
+def trellis_normalisation() -> LatentNormalisation:
+    """Of the latents that slat_flow_img_dit_L_64l8p2 was trained on: means of slat_enc_swin8_B_64l8."""
+    return LatentNormalisation(torch.tensor(_MEAN), torch.tensor(_STD))
+
+
+def published_slat_shapes(name: str) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a published network, e.g. "slat_enc_swin8_B_64l8"."""
+    manifest = json.loads((files("model.weights") / "data" / "trellis_slat.json").read_text("utf-8"))
+    return {key: tuple(shape) for key, shape in manifest[name].items()}
+
+
+def slat_networks(flow: SlatFlowConfig, vae: SlatVaeConfig) -> tuple[PublishedNetwork, ...]:
+    """The published networks of stage 2 for `import_networks`. ModelError: the flow pools otherwise than TRELLIS."""
+    if flow.pool_pseudo_count != 1:
+        raise ModelError(
+            _WHERE,
+            f"pool_pseudo_count is {flow.pool_pseudo_count}",
+            expected="1: the published flow was trained with sums divided by count + 1",
+            action="Set it to 1 in the configuration that imports.",
+        )
+    with torch.device("meta"):
+        modules = {
+            "flow": SlatFlow(flow),
+            "encoder": SlatEncoder(vae),
+            "surface": SurfaceDecoder(vae),
+            "gaussians": GaussianDecoder(vae),
+        }
+        fusion = ViewFusion(flow.condition_channels)
+    conversions = {
+        "flow": _flow_tensors,
+        "encoder": _encoder_tensors,
+        "surface": _surface_tensors,
+        "gaussians": _gaussian_tensors,
+    }
+    of_flow = {"resolution": flow.resolution, "num_heads": flow.heads, "patch_size": flow.patch}
+    of_vae = {"resolution": vae.resolution, "num_heads": vae.heads, "window_size": vae.window}
+    new = (f"{STAGE_TWO}context.*", *(f"{STAGE_TWO}fusion.{name}" for name in fusion.state_dict()))
+    return tuple(
+        PublishedNetwork(
+            name=name,
+            shapes=published_slat_shapes(name),
+            class_names=class_names,
+            arguments=of_flow if part == "flow" else of_vae | {"attn_mode": "swin"},
+            module=modules[part],
+            new=new if part == "flow" else (),
+            convert=conversions[part],
+        )
+        for part, (name, class_names) in _NETWORKS.items()
+    )
+
+
+def load_stage_two_start(path: Path, network: ViewConditionedSlatFlow) -> None:
+    """Weights of stage 2 to start from, before adapters are added: flow and normalisation, or all of it.
+
+    What the file has none of keeps its initial values. ModelError when a group does not fit.
+    """
+    load_weights(path, network.flow, group=SLAT_FLOW)
+    load_weights(path, network.normalisation, group=f"{STAGE_TWO}normalisation.")
+    rest = {f"{STAGE_TWO}context.": network.context, f"{STAGE_TWO}fusion.": network.fusion}
+    shapes = read_header(path, expected="a weight file", action="Correct the path.").shapes
+    if any(name.startswith(tuple(rest)) for name in shapes):
+        for group, module in rest.items():
+            load_weights(path, module, group=group)
+
+
+def _flow_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    normalisation = _published_normalisation(path).state_dict()
+    return _prefixed(SLAT_FLOW, tensors) | _prefixed(f"{STAGE_TWO}normalisation.", normalisation)
+
+
+def _encoder_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG001
+    return _prefixed(SLAT_ENCODER, tensors)
+
+
+def _surface_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG001
+    converted = {
+        name: pointwise_from_spconv(tensor) if name.endswith("skip_connection.conv.weight") else tensor
+        for name, tensor in tensors.items()
+    }
+    return _prefixed(SURFACE, converted)
+
+
+def _gaussian_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    error = float((tensors["offset_perturbation"].float() - offset_perturbation()).abs().max())
+    # Float16 is within 4e-4, bfloat16 4e-3; another sequence or order is off by about 1.
+    if not error < 1e-2:
+        raise ModelError(
+            path,
+            f"offset_perturbation differs by {error:.2g} from the Hammersley points",
+            expected="TRELLIS's layout of 32 gaussians per voxel",
+            action="Use an unmodified checkpoint.",
+        )
+    return _prefixed(GAUSSIANS, tensors)
+
+
+def _prefixed(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+    return {prefix + name: tensor for name, tensor in tensors.items()}
+
+
+def _published_normalisation(path: Path) -> LatentNormalisation:
+    """From the pipeline.json of the folder that the file is in, or its `ckpts`; without one, TRELLIS's."""
+    # Not resolved: in the cache of the hub, files are links to another folder.
+    candidates = [folder / "pipeline.json" for folder in path.absolute().parents[:2]]
+    pipeline = next((candidate for candidate in candidates if candidate.is_file()), None)
+    if pipeline is None:
+        return trellis_normalisation()
+    try:
+        found = json.loads(pipeline.read_text("utf-8"))["args"]["slat_normalization"]
+        mean, std = (torch.tensor(found[name], dtype=torch.float32) for name in ("mean", "std"))
+        return LatentNormalisation(mean, std)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ModelError(
+            pipeline,
+            f"args.slat_normalization cannot be read ({error})",
+            expected="lists mean and std, one number for each latent channel",
+            action="Copy it again, or move it away for TRELLIS-image-large's own values.",
+        ) from error

@@ -1,0 +1,226 @@
+"""Cost of stage 1: memory of a training step by number of views, time of a block, share of time spent waiting for data.
+
+Also a program, because peak memory is a property of a process: `python bench_model.py VIEWS` prints megabytes.
+"""
+
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from accelerate import Accelerator
+
+from model.config import OwnHandEncoder, TrainingConfig, load_config
+from model.data import open_motions
+from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
+from model.encoders.efficientnet import EfficientNetConfig, load_efficientnet
+from model.encoders.hand import HandEncoder, HandNet
+from model.flow import Guidance
+from model.sample import Batch
+from model.sparse_structure.dual_branch import DualBranchFlow
+from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
+from model.sparse_structure.vae import StructureVae
+from model.training.draws import sample_generators
+from model.training.source import StreamSource
+from model.training.trainer import StepReport, train
+
+ROOT = Path(__file__).resolve().parents[2]
+DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+VIEWS = (2, 4, 6, 12)
+
+
+def configuration(name: str) -> TrainingConfig:
+    return load_config(ROOT / "configs" / "model" / f"{name}.yaml")
+
+
+def stage_one_task(config: TrainingConfig) -> StageOneTask:
+    """The task of a configuration with open encoders, with random weights in all but the image encoder."""
+    part, hand = config.stage_one, config.encoders.hand
+    assert isinstance(config.encoders.image, EfficientNetConfig)
+    assert isinstance(hand, OwnHandEncoder)
+    assert config.hand_encoder is not None
+    torch.manual_seed(0)
+    image_encoder = load_efficientnet(config.encoders.image)
+    hand_encoder = HandEncoder(network=HandNet(config.hand_encoder.network).eval(), grid=hand.own_grid)
+    sizes = AggregatorConfig(
+        image_channels=image_encoder.channels,
+        image_grid=image_encoder.grid,
+        hand_channels=hand_encoder.channels,
+        hand_grid=hand_encoder.grid,
+        hand_width=part.hand_width,
+        hidden=part.hidden,
+        channels=part.network.masks.feature_channels,
+    )
+    return StageOneTask(
+        network=StageOne(FeatureAggregator(sizes), DualBranchFlow(part.network)).to(DEVICE),
+        image_encoder=image_encoder.to(DEVICE, torch.float32),
+        hand_encoder=hand_encoder.to(DEVICE, torch.float32),
+        vae=StructureVae(config.vae.network).to(DEVICE).eval().requires_grad_(False),
+        config=StageOneConfig(
+            beta=part.beta,
+            drop_condition=part.drop_condition,
+            time=part.time,
+            sampler=part.sampler,
+            guidance=Guidance(strength={"geometry": part.guidance_strength}, interval=part.guidance_interval),
+            latent_scale=1.0,
+        ),
+        mean_shape=torch.zeros(64, 64, 64, dtype=torch.bool),
+    )
+
+
+def random_batch(views: int, size: int) -> Batch:
+    masks = torch.zeros(1, views, size, size, dtype=torch.bool)
+    masks[..., size // 4 : size // 2, size // 4 : size // 2] = True
+    return Batch(
+        images=torch.rand(1, views, 3, size, size),
+        object_amodal=masks,
+        object_visible=masks,
+        hand_visible=~masks,
+        K=torch.eye(3).repeat(1, views, 1, 1),
+        T_cam_from_canonical=torch.eye(4).repeat(1, views, 1, 1),
+        occupancy=torch.rand(1, 64, 64, 64) > 0.9,
+        joints_px=torch.zeros(1, views, 21, 2),
+        is_right=torch.ones(1, dtype=torch.bool),
+        ids=("a:0:0",),
+    )
+
+
+def resident_mb() -> float:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / 1e6
+
+
+def step_memory_mb(views: int) -> float:
+    """Peak memory of one training step of one sample of `small`, above weights and libraries."""
+    config = configuration("small")
+    task = stage_one_task(config)
+    batch = random_batch(views, config.stage_one.recipe.image_size).to(DEVICE, torch.float32)
+    if DEVICE.type == "cuda":
+        torch.cuda.reset_peak_memory_stats()
+        before = torch.cuda.memory_allocated() / 1e6
+    else:
+        before = resident_mb()
+    task.loss(batch, sample_generators(0, 0, [0])).total.backward()
+    if DEVICE.type == "cuda":
+        return torch.cuda.max_memory_allocated() / 1e6 - before
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3 - before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_of_a_training_step_by_views(say):
+    peaks = {}
+    for views in VIEWS:
+        command = [sys.executable, str(Path(__file__)), str(views)]
+        environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+        done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+        peaks[views] = float(done.stdout)
+    say(f"peak memory of a training step of one sample, configs/model/small.yaml, {DEVICE.type}:")
+    for views, peak in peaks.items():
+        say(f"    {views:2d} views {peak:7.0f} MB  {peak / peaks[2]:4.1f}x")
+    say(f"    a view more: {(peaks[12] - peaks[2]) / 10:.0f} MB")
+    assert peaks[12] < 6 * peaks[2]  # less than in proportion to the views
+
+
+def milliseconds(function: Callable[[], object], repeats: int = 5) -> float:
+    """Median; processor time on a CPU, so other programs do not count."""
+    clock = time.perf_counter if DEVICE.type == "cuda" else time.process_time
+    seconds = []
+    for _ in range(1 + repeats):
+        start = clock()
+        function()
+        if DEVICE.type == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(clock() - start)
+    return 1e3 * statistics.median(seconds[1:])
+
+
+@pytest.fixture
+def one_thread():
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.mark.usefixtures("one_thread")
+@pytest.mark.parametrize("name", ["tiny", "small", pytest.param("paper", marks=pytest.mark.gpu)])
+def test_time_of_a_block(name, say):
+    if name == "paper" and DEVICE.type == "cpu":
+        pytest.skip("4,096 + 5,476 tokens of 1,024 channels are for a GPU")
+    views = 4
+    network = replace(configuration(name).stage_one.network, checkpoint_blocks=False)
+    flow = DualBranchFlow(network).to(DEVICE)
+    geometry, masks = network.geometry, network.masks
+    y = torch.randn(1, 1, geometry.tokens, geometry.channels, device=DEVICE, requires_grad=True)
+    x = torch.randn(1, views, masks.grid**2, masks.channels, device=DEVICE, requires_grad=True)
+    t = torch.full((1,), 0.5, device=DEVICE)
+    t_geometry, t_masks = flow.geometry.t_embedder(t).detach(), flow.masks.t_embedder(t).detach()
+    contexts, weights = flow.context(x).detach(), flow.fusion(x).detach()
+    one = torch.ones(1, 1, device=DEVICE)
+
+    blocks = {
+        f"geometry ({geometry.tokens} tokens)": lambda: flow.geometry.blocks[0](
+            y, t_geometry, contexts, weights
+        ),
+        f"mask ({views} x {masks.grid**2} tokens)": lambda: flow.masks.blocks[0](
+            x, t_masks, y[:, 0:1].detach(), one
+        ),
+    }
+    for block, forward in blocks.items():
+        with torch.no_grad():
+            alone = milliseconds(forward)
+        both = milliseconds(lambda forward=forward: forward().sum().backward())
+        say(f"{name}: {block} block, {views} views: {alone:.1f} ms forward, {both:.1f} ms with backward")
+        assert both > alone
+
+
+def test_share_of_time_spent_waiting_for_data(tmp_path, say):
+    """tiny.yaml as it is, on pictures that are as hard to decode as rendered ones."""
+    from tests.benchmarks.bench_loader import SIZE_PX, photographic
+    from tests.model.data.balls import write_balls
+
+    config = configuration("tiny")
+    part, steps = config.stage_one, 12
+    root = write_balls(
+        tmp_path / "balls",
+        splits=[["train"] * 4],
+        cameras=4,
+        n_frames=6,
+        size_px=SIZE_PX,
+        change_frame=photographic,
+    )
+    stream = replace(
+        config.data,
+        datasets=(str(root),),
+        batch_size=part.recipe.batch_size,
+        views=part.recipe.views,
+        image_size=part.recipe.image_size,
+    )
+    reports: list[StepReport] = []
+    train(
+        stage_one_task(config),
+        StreamSource(config=stream, index=open_motions(stream), rank=0, ranks=1),
+        replace(part.recipe.trainer, steps=steps, log_every=1, checkpoint_every=steps),
+        part.recipe.optimizer,
+        folder=tmp_path / "run",
+        config_yaml="bench",
+        config_sha256="bench",
+        report=reports.append,
+        accelerator=Accelerator(cpu=DEVICE.type == "cpu"),
+    )
+    shares = [report.waiting_share for report in reports[3:]]  # loader processes start during the first
+    speed = statistics.median(report.samples_per_s for report in reports[3:])
+    mean = statistics.mean(shares)
+    say(f"tiny on {DEVICE.type}: {speed:.1f} samples/s, {mean:.1%} of the time waiting for data (aim: < 5 %)")
+    assert mean < 0.15
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    print(step_memory_mb(int(sys.argv[1])))

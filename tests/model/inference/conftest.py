@@ -1,0 +1,29 @@
+"""One training of both stages for the tests of this folder."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.model.data.balls import write_balls
+from tests.model.inference.small_networks import small_stage_one, small_stage_two, train_small
+
+
+@dataclass(frozen=True, kw_only=True)
+class Runs:
+    """What the tests start from. Do not change it."""
+
+    dataset: Path
+    one: Path
+    two: Path
+
+
+@pytest.fixture(scope="session")
+def runs(tmp_path_factory) -> Runs:
+    root = tmp_path_factory.mktemp("runs")
+    dataset = write_balls(root / "balls", splits=[["train", "train"]], n_frames=4)
+    return Runs(
+        dataset=dataset,
+        one=train_small(root, "one", small_stage_one(dataset)),
+        two=train_small(root, "two", small_stage_two(dataset)),
+    )
