@@ -22,7 +22,7 @@ RUNTIME := $(VENV)/.runtime-installed
 DEV     := $(VENV)/.dev-installed
 TRAIN   := $(VENV)/.training-installed
 
-.PHONY: help setup render train test test-slow check bench clean
+.PHONY: help setup render train demo test test-slow check bench clean
 
 help: ## list the targets and their variables
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
@@ -59,6 +59,13 @@ render: $(RUNTIME) ## plan CONFIG into OUT if needed, then render shard SHARD
 train: $(TRAIN) ## train configs/model/tiny.yaml on shard 0 of DATA, rendering it if absent
 	@test -f $(DATA)/shards/shard-00000/shard.json || $(MAKE) --no-print-directory render SHARD=0 OUT=$(DATA)
 	@$(VENV)/bin/forehoi train configs/model/tiny.yaml $(ARGS)
+
+# figures.json of a part is written when its training is finished; a stopped one is continued.
+demo: $(TRAIN) ## train both stages of tiny unless that is done, then reconstruct a held-out clip into runs/demo
+	@test -f $(DATA)/shards/shard-00000/shard.json -a -f runs/tiny/stage_one/figures.json || \
+		$(MAKE) --no-print-directory train ARGS=
+	@test -f runs/tiny_slat/slat_flow/figures.json || $(VENV)/bin/forehoi train configs/model/tiny_slat.yaml
+	@$(VENV)/bin/forehoi reconstruct --held-out --out runs/demo --overwrite $(ARGS)
 
 test: $(DEV) ## run the tests, without those marked slow
 	@$(VENV)/bin/python -m pytest -q -m "not slow" $(ARGS)

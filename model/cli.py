@@ -1,5 +1,6 @@
 """The `forehoi` command: parse, call, print. Everything else lives in the modules it calls."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -10,9 +11,14 @@ from rich.table import Table
 from model.cli_options import plain_errors
 from model.cli_reconstruct import reconstruct_command
 from model.cli_weights import weights
-from model.config import TrainingConfig, load_config
+from model.config import TrainingConfig
+from model.errors import ModelError
+from model.figures_table import figures_table
+from model.slat_config import SlatTrainingConfig, load_any_config
 from model.training.parts import PARTS, train_part, trained_parts
 from model.training.progress import TrainingProgress
+from model.training.slat_parts import SLAT_PARTS, train_slat_part
+from model.training.trainer import StepReport
 
 __all__ = ["main"]
 
@@ -52,7 +58,9 @@ main.add_command(reconstruct_command)
 )
 @plain_errors
 def train(what: str, config_path: Path, out: Path | None) -> None:
-    """Train WHAT: a configuration (all parts that it trains), or one part: vae, hand_encoder, stage_one.
+    """Train WHAT: a configuration (all parts that it trains), or one part of it.
+
+    Parts of stage 1: vae, hand_encoder, stage_one; of stage 2: slat_vae, slat_flow.
 
     Continues where it was stopped. Over several processes: torchrun --nproc-per-node N -m model train ...
 
@@ -61,29 +69,55 @@ def train(what: str, config_path: Path, out: Path | None) -> None:
       forehoi train configs/model/tiny.yaml
       forehoi train hand_encoder --config configs/model/tiny.yaml
     """
-    path = config_path if what in PARTS else Path(what)
-    config = load_config(path)
-    names = (what,) if what in PARTS else trained_parts(config)
+    one_part = what in (*PARTS, *SLAT_PARTS)
+    path = config_path if one_part else Path(what)
+    config = load_any_config(path)
+    names = SLAT_PARTS if isinstance(config, SlatTrainingConfig) else trained_parts(config)
+    if one_part:
+        names = (_part_of(config, what, path),)
     folder = out or Path("runs") / path.stem
     accelerator = Accelerator()
     figures = {}
     for name in names:
         with TrainingProgress(name, enabled=accelerator.is_main_process) as bar:
-            figures[name] = train_part(name, config, folder, accelerator=accelerator, report=bar.update)
+            figures[name] = _train(name, config, folder, accelerator, bar.update)
     if accelerator.is_main_process:
         Console().print(_table(config, figures, folder))
 
 
-def _table(config: TrainingConfig, figures: dict[str, dict[str, float]], folder: Path) -> Table:
+def _part_of(config: TrainingConfig | SlatTrainingConfig, name: str, path: Path) -> str:
+    """The name, if it is a part of this configuration's stage."""
+    parts = SLAT_PARTS if isinstance(config, SlatTrainingConfig) else PARTS
+    if name not in parts:
+        raise ModelError(
+            path, f"has no {name}", expected=f"a part: {', '.join(parts)}", action="Give the other --config."
+        )
+    return name
+
+
+def _train(
+    name: str,
+    config: TrainingConfig | SlatTrainingConfig,
+    folder: Path,
+    accelerator: Accelerator,
+    report: Callable[[StepReport], None],
+) -> dict[str, float]:
+    if isinstance(config, SlatTrainingConfig):
+        return train_slat_part(name, config, folder, accelerator=accelerator, report=report)
+    return train_part(name, config, folder, accelerator=accelerator, report=report)
+
+
+def _table(
+    config: TrainingConfig | SlatTrainingConfig, figures: dict[str, dict[str, float]], folder: Path
+) -> Table:
     """Figures of every part, and what they were measured on."""
     same = config.validation.split == config.data.split
-    where = "held-out cameras" if same else f"objects of the {config.validation.split} split"
-    table = Table(title=f"{config.name}: figures on {where}", title_justify="left")
-    for column in ("part", "figure", "value"):
-        table.add_column(column, justify="right" if column == "value" else "left")
-    for part, values in figures.items():
-        for figure, value in values.items():
-            table.add_row(part, figure, f"{value:.3f}")
-    seen = "objects are those of the training" if same else "none of these objects was trained on"
-    table.caption = f"{seen}; checkpoints and TensorBoard logs: {folder}"
-    return table
+    where = (
+        "held-out cameras of the training motions"
+        if same
+        else f"objects of the {config.validation.split} split"
+    )
+    seen = "the objects are those of the training" if same else "none of these objects was trained on"
+    return figures_table(
+        f"{config.name}: figures on {where}", figures, f"{seen}; checkpoints and TensorBoard logs: {folder}"
+    )

@@ -1,7 +1,5 @@
 """`forehoi reconstruct`: a video, pictures or a clip in; masks, voxels and a mesh out."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -136,7 +134,8 @@ def reconstruct_command(
             one=open_stage_one(stage_one),
             two=open_stage_two(stage_two) if stages == "both" else None,
         )
-        with _progress() as clock:
+        with Console(stderr=True).status("") as status:  # in a terminal
+            clock = StageClock(status.update)
             result = _run(request, folder, clock)
     _print(result, out, clock)
 
@@ -197,17 +196,6 @@ def _device(name: str) -> torch.device:
             action="Use auto.",
         ) from error
     return device
-
-
-@contextmanager
-def _progress() -> Iterator[StageClock]:
-    """A clock whose running stage is shown: a moving line in a terminal, a line per stage elsewhere."""
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield StageClock(lambda name: console.print(f"{name} ...", soft_wrap=True))
-        return
-    with console.status("") as status:
-        yield StageClock(status.update)
 
 
 def _print(result: Reconstruction, out: Path, clock: StageClock) -> None:

@@ -7,9 +7,11 @@ from rich.console import Console
 from rich.table import Table
 
 from model.cli_options import plain_errors
-from model.config import load_config
+from model.slat_config import SlatTrainingConfig, load_any_config
 from model.weights.merging import export_run_adapter, merge_run
-from model.weights.trellis import ImportReport, import_published
+from model.weights.published import ImportReport, import_networks
+from model.weights.slat import slat_networks
+from model.weights.trellis import stage_one_networks
 
 __all__ = ["weights"]
 
@@ -44,20 +46,25 @@ def weights() -> None:
 )
 @plain_errors
 def import_weights(source: Path, config_path: Path, out: Path) -> None:
-    """Convert published TRELLIS weights of stage 1: SOURCE is a folder of them, or one file.
+    """Convert published TRELLIS weights of the configuration's stage: SOURCE is a folder of them, or one file.
 
-    The file that is written is what `vae.weights` and `stage_one.start.weights` of a configuration name.
+    The file that is written is what `vae.weights` and `stage_one.start.weights`, or `slat_flow.start`, of a
+    configuration name.
 
     \b
     Example:
       forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
     """
-    config = load_config(config_path)
-    report = import_published(source, flow=config.stage_one.network, vae=config.vae.network, out=out)
+    config = load_any_config(config_path)
+    if isinstance(config, SlatTrainingConfig):
+        networks = slat_networks(config.slat_flow.network, config.slat_vae.network)
+    else:
+        networks = stage_one_networks(config.stage_one.network, config.vae.network)
+    report = import_networks(source, networks, out)
     console = Console()
     console.print(_table(report))
     for path in report.ignored:
-        console.print(f"not of stage 1: {path}", soft_wrap=True)
+        console.print(f"not of this stage: {path}", soft_wrap=True)
     for name in report.absent:
         console.print(f"not in {source}: {name}", soft_wrap=True)
     console.print(f"every key: {report.key_list}", soft_wrap=True)

@@ -183,7 +183,7 @@ def join_surfaces(
 
     names = ("points", "normals", "colors", "sdf_points", "sdf_values")
     return SurfaceBatch(
-        **{name: joined(name) for name in names},  # type: ignore[arg-type]
+        **{name: joined(name) for name in names},
         point_counts=tuple(len(surface.points) for surface in surfaces),
         sdf_counts=tuple(len(surface.sdf_points) for surface in surfaces),
         object_uids=tuple(object_uids),

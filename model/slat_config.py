@@ -89,8 +89,9 @@ def parse_any_config(text: str, *, where: str) -> TrainingConfig | SlatTrainingC
         data = yaml.safe_load(text)
     except yaml.YAMLError as error:
         raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
-    of_stage_two = isinstance(data, dict) and bool(data.keys() & {"slat_vae", "slat_flow"})
-    return settings_from_dict(SlatTrainingConfig if of_stage_two else TrainingConfig, data, where=where)
+    if isinstance(data, dict) and data.keys() & {"slat_vae", "slat_flow"}:
+        return settings_from_dict(SlatTrainingConfig, data, where=where)
+    return settings_from_dict(TrainingConfig, data, where=where)
 
 
 def load_any_config(path: Path) -> TrainingConfig | SlatTrainingConfig:

@@ -44,7 +44,9 @@ def hand_losses(
     predicted from a Gaussian distribution, over the joints inside the picture), "side" (cross-entropy)."""
     batch_view = batch.images.shape[:2]
     view_losses = {
-        "mask": _mask_loss(output.mask_logits.float(), _covered(batch.hand_visible, output.mask_logits.shape[-1])),
+        "mask": _mask_loss(
+            output.mask_logits.float(), _covered(batch.hand_visible, output.mask_logits.shape[-1])
+        ),
         "object": _mask_loss(
             output.object_logits.float(), _covered(batch.object_visible, output.object_logits.shape[-1])
         ),
@@ -205,7 +207,10 @@ def _montage(output: HandOutput, batch: Batch) -> UInt8[np.ndarray, "height widt
     truth, inside = _true_joints(batch)
 
     def full(logits: Tensor) -> Tensor:
-        return functional.interpolate(logits[:, None].float(), size=(size, size), mode="bilinear")[:, 0].cpu() > 0
+        return (
+            functional.interpolate(logits[:, None].float(), size=(size, size), mode="bilinear")[:, 0].cpu()
+            > 0
+        )
 
     rows = (
         (batch.hand_visible.flatten(0, 1).cpu(), batch.object_visible.flatten(0, 1).cpu(), truth.cpu()),

@@ -66,13 +66,12 @@ def sample_mesh(mesh: SurfaceMesh, count: int, rng: np.random.Generator) -> Samp
     )
 
 
-def point_score(
-    found_m: Float[np.ndarray, "found 3"], true_m: Float[np.ndarray, "true 3"]
-) -> PointScore:
+def point_score(found_m: Float[np.ndarray, "found 3"], true_m: Float[np.ndarray, "true 3"]) -> PointScore:
     """Score of points in metres; where nothing was found, an infinite distance and no F-score."""
     if not len(found_m) or not len(true_m):
         return PointScore(chamfer_cm=float("inf"), f_5mm=0.0, f_10mm=0.0)
-    to_true, to_found = KDTree(true_m).query(found_m)[0], KDTree(found_m).query(true_m)[0]
+    to_true = np.asarray(KDTree(true_m).query(found_m)[0])
+    to_found = np.asarray(KDTree(found_m).query(true_m)[0])
     return PointScore(
         chamfer_cm=100.0 * float(to_true.mean() + to_found.mean()),
         f_5mm=_f_score(to_true, to_found, 0.005),

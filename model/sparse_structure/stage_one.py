@@ -1,5 +1,6 @@
 """Stage 1 as one module and its training: amodal masks and shape denoised together (paper, 3.1-3.3)."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -32,7 +33,16 @@ from model.sparse_structure.vae import StructureVae, occupancy_from_logits
 from model.training.draws import normal_like, uniform
 from model.training.task import Evaluation, Losses
 
-FIGURES = ("voxel_iou", "mean_shape_iou", "chamfer", "mask_iou", "visible_iou")
+FIGURES = (
+    "voxel_iou",
+    "mean_shape_iou",  # of the mean training shape, for every object
+    "chamfer",  # share of the cube's side
+    "mask_iou",  # of found and true amodal masks
+    "visible_iou",  # of the true visible mask in place of the amodal one
+    "occluded_mask_iou",  # the same two where at least OCCLUDED of the object is hidden
+    "occluded_visible_iou",
+)
+OCCLUDED = 0.2
 
 __all__ = ["FIGURES", "StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
 
@@ -111,7 +121,7 @@ class StageOneTask:
     def predict(
         self, images: Float[Tensor, "batch view 3 size size"], generator: torch.Generator
     ) -> Prediction:
-        """Denoise masks and shape together, with guidance on the shape alone by the default config."""
+        """Denoise masks and shape together; guidance as `config.guidance` says, per tensor name."""
         features = self.features(images)
         flow = self.network.flow
         resolution = flow.config.masks.mask_resolution
@@ -137,32 +147,38 @@ class StageOneTask:
 
     @torch.no_grad()
     def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
-        """voxel_iou, chamfer (share of the cube's side), mask_iou against the amodal truth; fixed noise.
-
-        Beside them what they have to beat: mean_shape_iou, the mean training shape for every object, and
-        visible_iou, the true visible mask in place of the amodal one.
-        """
+        """Means of FIGURES over samples or views, with fixed noise; a figure without views is NaN."""
         figures: dict[str, list[float]] = {name: [] for name in FIGURES}
         pictures: dict[str, np.ndarray] = {}
         generator = torch.Generator().manual_seed(0)
         for batch in batches:
             found = self.predict(batch.images, generator)
-            amodal = batch.object_amodal.flatten(0, 1)
-            masks = _full_size(found.masks, amodal.shape[-1]).flatten(0, 1) > 0
-            figures["voxel_iou"] += intersection_over_union(found.occupancy, batch.occupancy).tolist()
-            mean_shape = self.mean_shape.to(batch.occupancy.device).expand_as(batch.occupancy)
-            figures["mean_shape_iou"] += intersection_over_union(mean_shape, batch.occupancy).tolist()
-            figures["mask_iou"] += intersection_over_union(masks, amodal).tolist()
-            figures["visible_iou"] += intersection_over_union(
-                batch.object_visible.flatten(0, 1), amodal
-            ).tolist()
-            figures["chamfer"] += [
-                voxel_chamfer(a.cpu(), b.cpu()) for a, b in zip(found.occupancy, batch.occupancy)
-            ]
+            for name, values in _scores(batch, found, self.mean_shape).items():
+                figures[name] += values.tolist()
             if not pictures:
                 pictures = {"prediction": prediction_rows(batch, found)}
-        means = {name: sum(values) / max(len(values), 1) for name, values in figures.items()}
+        means = {name: sum(values) / len(values) if values else math.nan for name, values in figures.items()}
         return Evaluation(figures=means, pictures=pictures)
+
+
+def _scores(
+    batch: Batch, found: Prediction, mean_shape: Bool[Tensor, "64 64 64"]
+) -> dict[str, Float[Tensor, " n"]]:
+    guess = mean_shape.to(batch.occupancy.device).expand_as(batch.occupancy)
+    amodal, visible = batch.object_amodal.flatten(0, 1), batch.object_visible.flatten(0, 1)
+    masks = _full_size(found.masks, amodal.shape[-1]).flatten(0, 1) > 0
+    mask_iou, visible_iou = (intersection_over_union(mask, amodal) for mask in (masks, visible))
+    occluded = visible_iou < 1 - OCCLUDED  # a visible mask lies inside the amodal one
+    chamfer = [voxel_chamfer(a.cpu(), b.cpu()) for a, b in zip(found.occupancy, batch.occupancy)]
+    return {
+        "voxel_iou": intersection_over_union(found.occupancy, batch.occupancy),
+        "mean_shape_iou": intersection_over_union(guess, batch.occupancy),
+        "chamfer": torch.tensor(chamfer),
+        "mask_iou": mask_iou,
+        "visible_iou": visible_iou,
+        "occluded_mask_iou": mask_iou[occluded],
+        "occluded_visible_iou": visible_iou[occluded],
+    }
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,9 +5,12 @@ features of many views averaged on the voxels (FORMATS 4.5).
 
 The signed distance at a corner is extrapolated from the nearest sample, value + normal . (corner - sample).
 Samples are the surface points (value 0, their normal) and the signed-distance samples; the gradient of one of
-these is the normal of that of the four nearest surface points whose plane explains its value best. Against the
-meshes of the 48 starter objects: see tests/model/structured_latent/test_features.py for a ball and a plate, and
-`FEATURES_NOTE` below for the figures.
+these is the normal of that of the four nearest surface points whose plane explains its value best.
+
+How exact: against the solids of the 48 starter objects (8,192 surface and 12,288 distance samples each) the mean
+error is 0.06 voxels (median over objects 0.03, worst 0.23: an object of thin bars), the 95th percentile 0.3, and
+2.2 % of the corners further than 0.1 voxels from the surface are on the wrong side (worst 12 %). 47 % of the active
+voxels hold no surface point (worst 85 %). It takes 0.13 s per object.
 """
 
 from dataclasses import dataclass
@@ -156,7 +159,7 @@ def projected_features(
         at, seen = _projected(centers, K_view, T, image.shape[-1])
         tokens = encoder(image[None, None])[0, 0].float()
         grid = tokens.T.unflatten(1, (encoder.grid, encoder.grid))[None]
-        # align_corners=False: token (r, c) is centred at ((c + 0.5), (r + 0.5)) / grid of the sides, as encoders promise.
+        # align_corners=False: token (r, c) is centred at (c + 0.5, r + 0.5) / grid of the sides, as encoders promise.
         sampled = torch.nn.functional.grid_sample(
             grid, at[None, None], mode="bilinear", padding_mode="border", align_corners=False
         )[0, :, 0].T
@@ -166,7 +169,10 @@ def projected_features(
 
 
 def _projected(
-    points: Float[Tensor, "point 3"], K: Float[Tensor, "3 3"], T_cam_from_canonical: Float[Tensor, "4 4"], size: int
+    points: Float[Tensor, "point 3"],
+    K: Float[Tensor, "3 3"],
+    T_cam_from_canonical: Float[Tensor, "4 4"],
+    size: int,
 ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, "point"]]:
     """Projections in -1..1 over the picture, and whether they are inside and in front of the camera."""
     points_cam = points @ T_cam_from_canonical[:3, :3].T + T_cam_from_canonical[:3, 3]

@@ -50,7 +50,13 @@ class ObjectInputs:
 
     def _features(self, occupancy: Bool[np.ndarray, "i j k"], surface: ObjectSurface) -> VoxelFeatures:
         digest = hashlib.blake2b(np.packbits(occupancy).tobytes(), digest_size=16)
-        for samples in (surface.points, surface.normals, surface.colors, surface.sdf_points, surface.sdf_values):
+        for samples in (
+            surface.points,
+            surface.normals,
+            surface.colors,
+            surface.sdf_points,
+            surface.sdf_values,
+        ):
             digest.update(np.ascontiguousarray(samples).data)
         return self._kept.get(
             digest.digest(),

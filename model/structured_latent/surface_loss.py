@@ -70,8 +70,20 @@ def surface_loss(
 ) -> SurfaceLoss:
     """Terms of a batch. `corner_estimates`: signed distance at the corners of the latent's voxels, in such voxels.
 
-    A sample without samples in active voxels has zero in the terms that need them.
+    A sample without samples in active voxels has zero in the terms that need them. In float32 under autocast too:
+    bfloat16 would hold a place in the lattice to half a cell.
     """
+    with torch.autocast(decoded.features.device.type, enabled=False):
+        return _terms(decoded, latent, truth, corner_estimates, config)
+
+
+def _terms(
+    decoded: SparseTensor,
+    latent: SlatDistribution,
+    truth: SurfaceBatch,
+    corner_estimates: Float[Tensor, "voxel 8"],
+    config: SurfaceLossConfig,
+) -> SurfaceLoss:
     lattice = decoded_lattice(decoded)
     coarse = latent.mean.grid
     cells = decoded.grid.resolution / coarse.resolution  # per voxel of the latent grid

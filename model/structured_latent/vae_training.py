@@ -81,7 +81,8 @@ class SlatVaeTask:
                     meshes[uid] = scored_mesh(decoded, index, truth, self.evaluation)
                     rows.append((truth, (meshes[uid].mesh,)))
         return Evaluation(
-            figures=mean_scores(list(meshes.values())), pictures={"truth_and_reconstruction": comparison(rows)}
+            figures=mean_scores(list(meshes.values())),
+            pictures={"truth_and_reconstruction": comparison(rows)},
         )
 
 

@@ -99,6 +99,9 @@ def run_part(
         accelerator=accelerator,
     )
     path = folder / "figures.json"
+    if not last and not path.exists():  # stopped between the last checkpoint and the figures
+        load_part(folder, task.module, config_sha256=config_sha256)
+        validate()
     if last and accelerator.is_main_process:
         path.write_text(json.dumps(last[0].figures, indent=2), encoding="utf-8")
     accelerator.wait_for_everyone()

@@ -4,9 +4,8 @@ RUN/vae, RUN/hand_encoder, RUN/stage_one    checkpoints, TensorBoard logs, figur
 RUN/hand_encoder/hand_encoder.{safetensors,json}    its averaged weights in float16, for `load_hand_net`
 """
 
-import json
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -17,37 +16,31 @@ from torch import Tensor, nn
 
 from model.config import (
     ImportedVae,
-    PackagedHandEncoder,
+    OwnHandEncoder,
     Recipe,
     StageOnePart,
     TrainingConfig,
     VaePart,
     as_yaml,
 )
-from model.data import ShardStream, open_motions, validation_config
+from model.data import ShardStream
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
-from model.encoders.cached import CachedEncoder
-from model.encoders.dino import DinoConfig, load_dino
-from model.encoders.efficientnet import load_efficientnet
-from model.encoders.hand import HandEncoder, HandNet, packaged_hand_net, save_hand_net
+from model.encoders.hand import HandEncoder, HandNet, save_hand_net
 from model.encoders.hand_training import HandTask
 from model.encoders.protocol import FeatureEncoder
-from model.encoders.wilor import WilorConfig, load_wilor
 from model.errors import ModelError
 from model.evaluation.overlap import mean_shape
 from model.flow import Guidance
 from model.networks.lora import add_lora
-from model.sample import Batch
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.sparse_structure.vae_training import VaeTask
-from model.stream_config import StreamConfig
-from model.training.checkpoint import latest_checkpoint, load_average
+from model.training.frozen_encoders import given_hand_encoder, image_encoder, with_cache
 from model.training.identity import part_sha256
-from model.training.source import StreamSource
-from model.training.task import Evaluation, Task
-from model.training.trainer import StepReport, train
+from model.training.part_run import load_part, part_data, run_part
+from model.training.task import Task
+from model.training.trainer import StepReport
 from model.weights.weight_file import VAE, load_start, load_weights
 
 __all__ = ["PARTS", "load_stage_one", "train_part", "trained_parts"]
@@ -59,23 +52,6 @@ def trained_parts(config: TrainingConfig) -> tuple[str, ...]:
     """The parts that this configuration trains, in order; the others have weights already."""
     given = {"vae": isinstance(config.vae, ImportedVae), "hand_encoder": config.hand_encoder is None}
     return tuple(name for name in PARTS if not given.get(name))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Data:
-    """Streams of one part."""
-
-    training: StreamSource
-    held_out: StreamConfig
-    batches: int
-
-    def validation(self) -> Iterator[Batch]:
-        """The same held-out views every time."""
-        stream = ShardStream(self.held_out)
-        try:
-            yield from islice(stream, self.batches)
-        finally:
-            stream.close()
 
 
 def train_part(
@@ -91,38 +67,28 @@ def train_part(
     Continues where it was stopped. ModelError when an earlier part is missing or of another configuration.
     """
     recipe = _recipe(name, config)
-    data = _data(config, recipe, accelerator)
+    data = part_data(config.data, config.validation, recipe, accelerator)
     task = _task(name, config, folder, accelerator.device)
-    last: list[Evaluation] = []
-
-    def validate() -> Evaluation:
-        last[:] = [_evaluate(task, data.validation(), accelerator.device)]
-        return last[0]
-
-    train(
+    figures = run_part(
         task,
-        data.training,
-        recipe.trainer,
-        recipe.optimizer,
-        folder=folder / name,
+        data,
+        recipe,
+        folder / name,
         config_yaml=as_yaml(config),
         config_sha256=part_sha256(name, config),
-        validate=validate,
-        report=report,
         accelerator=accelerator,
+        report=report,
     )
-    path = folder / name / "figures.json"
-    if not last and not path.exists():  # stopped between the last checkpoint and the figures
-        _load(folder, name, config, task.module)
-        validate()
-    if last and accelerator.is_main_process:
-        if isinstance(task, HandTask):
-            _load(folder, name, config, task.network)
-            save_hand_net(task.network, folder / name, dtype=torch.float16)
-        path.write_text(json.dumps(last[0].figures, indent=2), encoding="utf-8")
-    accelerator.wait_for_everyone()
-    figures: dict[str, float] = json.loads(path.read_text(encoding="utf-8"))
+    if isinstance(task, HandTask) and accelerator.is_main_process:
+        _export_hand_net(task.network, config, folder)
     return figures
+
+
+def _export_hand_net(network: HandNet, config: TrainingConfig, folder: Path) -> None:
+    """The averaged weights, for `load_hand_net`; once."""
+    if not (folder / "hand_encoder" / "hand_encoder.safetensors").exists():
+        _load(folder, "hand_encoder", config, network)
+        save_hand_net(network, folder / "hand_encoder", dtype=torch.float16)
 
 
 def load_stage_one(config: TrainingConfig, folder: Path, device: torch.device) -> StageOneTask:
@@ -131,10 +97,6 @@ def load_stage_one(config: TrainingConfig, folder: Path, device: torch.device) -
     _load(folder, "stage_one", config, task.module)
     task.module.to(device).eval()
     return task
-
-
-def _evaluate(task: Task, batches: Iterable[Batch], device: torch.device) -> Evaluation:
-    return task.evaluate(task.module, (batch.to(device, torch.float32) for batch in batches))
 
 
 def _recipe(name: str, config: TrainingConfig) -> Recipe:
@@ -147,30 +109,6 @@ def _recipe(name: str, config: TrainingConfig) -> Recipe:
             action="Train one of these, or give a configuration with a recipe for it.",
         )
     return part.recipe
-
-
-def _data(config: TrainingConfig, recipe: Recipe, accelerator: Accelerator) -> _Data:
-    stream = replace(
-        config.data, batch_size=recipe.batch_size, views=recipe.views, image_size=recipe.image_size
-    )
-    split = config.validation.split
-    held_out = validation_config(
-        stream,
-        split=split,
-        cameras="held_out" if split == stream.split else "all",
-        views=config.validation.views,
-        batch_size=config.validation.batch_size,
-    )
-    return _Data(
-        training=StreamSource(
-            config=stream,
-            index=open_motions(stream),
-            rank=accelerator.process_index,
-            ranks=accelerator.num_processes,
-        ),
-        held_out=replace(held_out, workers=0, samples_per_motion=config.validation.samples_per_motion),
-        batches=config.validation.batches,
-    )
 
 
 def _task(name: str, config: TrainingConfig, folder: Path, device: torch.device) -> Task:
@@ -189,7 +127,7 @@ def _stage_one_task(config: TrainingConfig, folder: Path, device: torch.device) 
     part = config.stage_one
     vae = _vae(config, folder).to(device)
     shapes = _training_shapes(config)
-    image, hand = _image_encoder(config), _hand_encoder(config, folder)
+    image, hand = image_encoder(config.encoders), _hand_encoder(config, folder)
     image.to(device, torch.float32)
     hand.to(device, torch.float32)
     aggregator = FeatureAggregator(
@@ -255,47 +193,17 @@ def _latent_scale(vae: StructureVae, shapes: Bool[Tensor, "shape 64 64 64"], dev
     return float(torch.cat(squares).mean().sqrt())
 
 
-def _image_encoder(config: TrainingConfig) -> FeatureEncoder:
-    chosen = config.encoders.image
-    encoder: FeatureEncoder = (
-        load_dino(chosen) if isinstance(chosen, DinoConfig) else load_efficientnet(chosen)
-    )
-    return _cached(encoder, config)
-
-
 def _hand_encoder(config: TrainingConfig, folder: Path) -> FeatureEncoder:
     chosen = config.encoders.hand
-    if isinstance(chosen, WilorConfig):
-        return _cached(load_wilor(chosen), config)
-    if isinstance(chosen, PackagedHandEncoder):
-        return _cached(HandEncoder(network=packaged_hand_net(), grid=chosen.packaged_grid), config)
+    if not isinstance(chosen, OwnHandEncoder):
+        return given_hand_encoder(config.encoders)
     assert config.hand_encoder is not None  # TrainingConfig sees to it
     network = HandNet(config.hand_encoder.network)
     _load(folder, "hand_encoder", config, network)
     network.eval().requires_grad_(False)
-    return _cached(HandEncoder(network=network, grid=chosen.own_grid), config)
-
-
-def _cached(encoder: FeatureEncoder, config: TrainingConfig) -> FeatureEncoder:
-    views = config.encoders.cached_views
-    return CachedEncoder(encoder=encoder, max_views=views) if views else encoder
+    return with_cache(HandEncoder(network=network, grid=chosen.own_grid), config.encoders)
 
 
 def _load(folder: Path, name: str, config: TrainingConfig, module: nn.Module) -> None:
     """Averaged weights of a trained part. ModelError when it is missing or of another configuration."""
-    path = latest_checkpoint(folder / name / "checkpoints")
-    if path is None:
-        raise ModelError(
-            folder / name,
-            "holds no checkpoint",
-            expected=f"the trained {name}",
-            action=f"Train it first: forehoi train {name}.",
-        )
-    state = load_average(path, module)
-    if state.config_sha256 != (ours := part_sha256(name, config)):
-        raise ModelError(
-            path,
-            f"was trained with another configuration ({state.config_sha256[:12]})",
-            expected=f"configuration {ours[:12]}",
-            action=f"Train the {name} of this configuration into another folder (--out).",
-        )
+    load_part(folder / name, module, config_sha256=part_sha256(name, config))

@@ -11,16 +11,9 @@ from pathlib import Path
 import torch
 from accelerate import Accelerator
 
-from model.config import EncodersConfig, OwnHandEncoder, PackagedHandEncoder, as_yaml
+from model.config import as_yaml
 from model.data import ShardStream
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
-from model.encoders.cached import CachedEncoder
-from model.encoders.dino import DinoConfig, load_dino
-from model.encoders.efficientnet import load_efficientnet
-from model.encoders.hand import HandEncoder, packaged_hand_net
-from model.encoders.protocol import FeatureEncoder
-from model.encoders.wilor import load_wilor
-from model.errors import ModelError
 from model.flow import Guidance
 from model.networks.lora import add_lora
 from model.networks.sparse.tensor import SparseTensor
@@ -32,6 +25,7 @@ from model.structured_latent.latent import LatentNormalisation
 from model.structured_latent.object_input import ObjectInputs
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
+from model.training.frozen_encoders import given_hand_encoder, image_encoder
 from model.training.part_run import load_part, part_data, run_part
 from model.training.task import Task
 from model.training.trainer import StepReport
@@ -59,9 +53,7 @@ def train_slat_part(
     recipe = config.slat_vae.recipe if name == SLAT_VAE else config.slat_flow.recipe
     data = part_data(replace(config.data, surface=True), config.validation, recipe, accelerator)
     torch.manual_seed(recipe.trainer.seed)  # of the initial weights
-    task: Task = (
-        _vae_task(config) if name == SLAT_VAE else _flow_task(config, folder, accelerator.device)
-    )
+    task: Task = _vae_task(config) if name == SLAT_VAE else _flow_task(config, folder, accelerator.device)
     return run_part(
         task,
         data,
@@ -115,7 +107,7 @@ def _assembled(
     config: SlatTrainingConfig, vae: SlatVae, normalisation: LatentNormalisation, device: torch.device
 ) -> SlatFlowTask:
     part = config.slat_flow
-    image, hand = _encoders(config.encoders)
+    image, hand = image_encoder(config.encoders), given_hand_encoder(config.encoders)
     image.to(device, torch.float32)
     hand.to(device, torch.float32)
     aggregator = FeatureAggregator(
@@ -172,28 +164,3 @@ def _training_latents(
         if (uid := on_device.true_surface.object_uids[0]) not in seen:
             seen.add(uid)
             yield vae.encoder(inputs(on_device).features).mean
-
-
-def _encoders(config: EncodersConfig) -> tuple[FeatureEncoder, FeatureEncoder]:
-    """The frozen encoders of pictures and hands."""
-    image: FeatureEncoder = (
-        load_dino(config.image) if isinstance(config.image, DinoConfig) else load_efficientnet(config.image)
-    )
-    if isinstance(config.hand, OwnHandEncoder):
-        raise ModelError(
-            "encoders.hand",
-            "is the hand encoder that stage 1 trains",
-            expected="one that is there already: {packaged_grid: N}, or WiLoR",
-            action="Change it; stage 2 trains no hand encoder.",
-        )
-    hand: FeatureEncoder = (
-        HandEncoder(network=packaged_hand_net(), grid=config.hand.packaged_grid)
-        if isinstance(config.hand, PackagedHandEncoder)
-        else load_wilor(config.hand)
-    )
-    if config.cached_views:
-        return (
-            CachedEncoder(encoder=image, max_views=config.cached_views),
-            CachedEncoder(encoder=hand, max_views=config.cached_views),
-        )
-    return image, hand

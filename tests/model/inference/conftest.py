@@ -6,7 +6,12 @@ from pathlib import Path
 import pytest
 
 from tests.model.data.balls import write_balls
-from tests.model.inference.small_networks import small_stage_one, small_stage_two, train_small
+from tests.model.inference.small_networks import (
+    small_stage_one,
+    small_stage_two,
+    train_stage_one,
+    train_stage_two,
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,6 +29,6 @@ def runs(tmp_path_factory) -> Runs:
     dataset = write_balls(root / "balls", splits=[["train", "train"]], n_frames=4)
     return Runs(
         dataset=dataset,
-        one=train_small(root, "one", small_stage_one(dataset)),
-        two=train_small(root, "two", small_stage_two(dataset)),
+        one=train_stage_one(root / "one", small_stage_one(dataset)),
+        two=train_stage_two(root / "two", small_stage_two(dataset)),
     )

@@ -5,19 +5,26 @@ from typing import Any
 
 import torch
 import yaml
+from accelerate import Accelerator
 from safetensors.torch import load_file, save_file
 
+from model.inference.networks import open_stage_one
+from model.slat_config import SlatTrainingConfig, load_any_config
 from model.training.checkpoint import latest_checkpoint
+from model.training.parts import load_stage_one
+from model.training.slat_parts import SLAT_PARTS, train_slat_part
 from tests.model.small_run import ROOT, forehoi, small_settings, write_config
 
 TINY_SLAT = ROOT / "configs" / "model" / "tiny_slat.yaml"
-VAE_STEPS = 40  # a shape that is neither empty nor full
+FILLED = 0.004  # of the cube, once `fill_some` has been called
+_LAST_BIAS = "decoder.out_layer.2.bias"
 
 
 def small_stage_one(dataset: Path) -> dict[str, Any]:
     """The content of a configuration of stage 1."""
     config = small_settings(dataset)
-    config["vae"]["recipe"]["trainer"] |= {"steps": VAE_STEPS, "validate_every": VAE_STEPS}
+    config["hand_encoder"] = None
+    config["encoders"]["hand"] = {"packaged_grid": 8}
     return config
 
 
@@ -39,19 +46,39 @@ def small_stage_two(dataset: Path) -> dict[str, Any]:
     return config
 
 
-def train_small(folder: Path, name: str, settings: dict[str, Any]) -> Path:
-    """The run of all parts, in folder/name."""
-    config = write_config(folder / f"{name}.yaml", settings)
-    status, output = forehoi("train", config, "--out", folder / name)
+def train_stage_one(folder: Path, settings: dict[str, Any]) -> Path:
+    """The run of all its parts; its shapes are noise, neither empty nor full."""
+    config = write_config(folder.with_suffix(".yaml"), settings)
+    status, output = forehoi("train", config, "--out", folder)
     assert status == 0, output
-    return folder / name
+    fill_some(folder)
+    return folder
 
 
-def empty_decoder(run: Path) -> None:
-    """Makes the VAE of a run decode everything to nothing: its last bias is far below zero."""
+def train_stage_two(folder: Path, settings: dict[str, Any]) -> Path:
+    """The run of all its parts."""
+    config = load_any_config(write_config(folder.with_suffix(".yaml"), settings))
+    assert isinstance(config, SlatTrainingConfig)
+    for part in SLAT_PARTS:
+        train_slat_part(part, config, folder, accelerator=Accelerator(), report=lambda _: None)
+    return folder
+
+
+def fill_some(run: Path) -> None:
+    """Two steps leave a decoder that fills nothing or all: moves its last bias until noise fills FILLED of the cube."""
+    task = load_stage_one(open_stage_one(run).config, run, torch.device("cpu"))
+    shape = task.network.flow.config.geometry.latent_shape
+    noise = torch.randn(1, *shape, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        logits = task.vae.decoder(noise * task.config.latent_scale)
+    change_last_bias(run, -float(logits.flatten().quantile(1 - FILLED)))
+
+
+def change_last_bias(run: Path, change: float) -> None:
+    """Adds to every logit of the VAE of a run."""
     path = latest_checkpoint(run / "vae" / "checkpoints")
     assert path is not None
     for name in ("weights.safetensors", "average.safetensors"):
         tensors = load_file(path / name)
-        tensors["decoder.out_layer.2.bias"] = torch.full_like(tensors["decoder.out_layer.2.bias"], -1e4)
+        tensors[_LAST_BIAS] = tensors[_LAST_BIAS] + change
         save_file(tensors, path / name)

@@ -28,7 +28,8 @@ PAPER = GeometryBranchConfig(
     condition_channels=1024,
     blocks=24,
     heads=16,
-    mlp_ratio=4, preconditioned=False,
+    mlp_ratio=4,
+    preconditioned=False,
 )
 SMALL = GeometryBranchConfig(
     latent_resolution=2,
@@ -38,7 +39,8 @@ SMALL = GeometryBranchConfig(
     condition_channels=10,
     blocks=2,
     heads=2,
-    mlp_ratio=2, preconditioned=False,
+    mlp_ratio=2,
+    preconditioned=False,
 )
 
 

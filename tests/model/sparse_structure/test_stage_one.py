@@ -1,5 +1,7 @@
 """The stage-1 task on small sizes: losses reach every trained part, prediction is repeatable, targets are exact."""
 
+import math
+
 import pytest
 import torch
 from jaxtyping import Float
@@ -11,7 +13,7 @@ from model.sample import Batch
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.geometry_branch import GeometryBranchConfig
 from model.sparse_structure.mask_branch import MaskBranchConfig
-from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask, mask_targets
+from model.sparse_structure.stage_one import FIGURES, StageOne, StageOneConfig, StageOneTask, mask_targets
 from model.sparse_structure.vae import StructureVae, VaeConfig
 from model.sparse_structure.vae_training import turned
 from model.training.draws import sample_generators
@@ -36,7 +38,9 @@ class MeanColor:
 @pytest.fixture
 def task() -> StageOneTask:
     torch.manual_seed(0)
-    vae = VaeConfig(patch=1, channels=(4, 4, 8, 8), latent_channels=4, residual_blocks=(1, 1, 1, 1), middle_blocks=1)
+    vae = VaeConfig(
+        patch=1, channels=(4, 4, 8, 8), latent_channels=4, residual_blocks=(1, 1, 1, 1), middle_blocks=1
+    )
     flow = DualBranchConfig(
         geometry=GeometryBranchConfig(
             latent_resolution=8,
@@ -46,7 +50,8 @@ def task() -> StageOneTask:
             condition_channels=32,
             blocks=2,
             heads=2,
-            mlp_ratio=2, preconditioned=False,
+            mlp_ratio=2,
+            preconditioned=False,
         ),
         masks=MaskBranchConfig(
             feature_channels=16, grid=4, patch=4, channels=32, blocks=2, heads=2, mlp_ratio=2
@@ -130,7 +135,12 @@ def test_prediction_is_repeatable_and_has_the_sizes_of_its_inputs(task, batch):
 
 def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
     evaluation = task.evaluate(task.module, [batch])
+    assert tuple(evaluation.figures) == FIGURES
     assert evaluation.figures["visible_iou"] == pytest.approx(0.5)
+    assert evaluation.figures["occluded_visible_iou"] == pytest.approx(0.5)
+    assert evaluation.figures["occluded_mask_iou"] == evaluation.figures["mask_iou"]
+    batch.object_visible[:] = batch.object_amodal
+    assert math.isnan(task.evaluate(task.module, [batch]).figures["occluded_mask_iou"])
     assert 0.0 <= evaluation.figures["mask_iou"] <= 1.0
     assert evaluation.pictures["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
 

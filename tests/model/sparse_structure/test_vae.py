@@ -25,11 +25,14 @@ def _sphere(resolution: int, radius: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize(
-    ("patch", "channels", "latent"), [(1, (4, 8, 16), 16), (1, (4, 4, 8, 8), 8), (2, (8, 16), 16), (4, (8, 8), 8)]
+    ("patch", "channels", "latent"),
+    [(1, (4, 8, 16), 16), (1, (4, 4, 8, 8), 8), (2, (8, 16), 16), (4, (8, 8), 8)],
 )
 def test_64_cubed_to_its_latent_and_back(patch: int, channels: tuple[int, ...], latent: int) -> None:
     blocks = (0,) + (1,) * (len(channels) - 1)
-    config = VaeConfig(patch=patch, channels=channels, latent_channels=8, residual_blocks=blocks, middle_blocks=1)
+    config = VaeConfig(
+        patch=patch, channels=channels, latent_channels=8, residual_blocks=blocks, middle_blocks=1
+    )
     vae = StructureVae(config)
     assert config.latent_shape(64) == (8, latent, latent, latent)
     with torch.no_grad():

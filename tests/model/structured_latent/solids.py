@@ -28,9 +28,10 @@ def plate_distance(half: np.ndarray) -> Distance:
 def _surface(
     points: np.ndarray, normals: np.ndarray, distance: Distance, rng: np.random.Generator
 ) -> ObjectSurface:
-    near = points[: len(points) // 2] + 0.02 * rng.standard_normal((len(points) // 2, 1)) * normals[
-        : len(points) // 2
-    ]
+    near = (
+        points[: len(points) // 2]
+        + 0.02 * rng.standard_normal((len(points) // 2, 1)) * normals[: len(points) // 2]
+    )
     sdf_points = np.concatenate([near, rng.uniform(-0.5, 0.5, (len(points) // 4, 3))])
     return ObjectSurface(
         points=points.astype(np.float32),

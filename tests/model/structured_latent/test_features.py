@@ -71,9 +71,7 @@ def test_voxels_without_points_are_counted_and_take_the_nearest_point():
 
 def test_an_object_without_points_is_refused():
     surface = ball()
-    bare = replace(
-        surface, points=surface.points[:0], normals=surface.normals[:0], colors=surface.colors[:0]
-    )
+    bare = replace(surface, points=surface.points[:0], normals=surface.normals[:0], colors=surface.colors[:0])
     with pytest.raises(ModelError, match="no surface point"):
         object_features(bare, np.zeros((1, 3), int), RESOLUTION)
 
@@ -126,7 +124,9 @@ def test_projected_features_are_what_is_at_the_projections():
         cam = centers @ t[:3, :3].T + t[:3, 3]
         uvw = cam @ k.T
         expected.append(uvw[:, :2] / uvw[:, 2:] / size)
-    torch.testing.assert_close(found.features[:, :2], torch.stack(expected).mean(0).float(), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        found.features[:, :2], torch.stack(expected).mean(0).float(), atol=1e-5, rtol=0
+    )
     assert (found.views == 2).all()
 
 

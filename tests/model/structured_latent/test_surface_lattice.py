@@ -53,13 +53,17 @@ def test_a_plane_stays_a_plane_under_any_deformation(seed):
     normal = torch.nn.functional.normalize(torch.randn(3, generator=generator), dim=0)
     decoded = SparseTensor(grid=grid, features=random_channels(grid, seed, 0.4))
     lattice = with_plane(decoded_lattice(decoded), normal, 4.0)
-    points = (torch.rand(60, 3, generator=generator) * torch.tensor([4, 4, 2.0]) + torch.tensor([2, 2, 3.0])) / 8 - 0.5
+    points = (
+        torch.rand(60, 3, generator=generator) * torch.tensor([4, 4, 2.0]) + torch.tensor([2, 2, 3.0])
+    ) / 8 - 0.5
     field = lattice.at(points, torch.zeros(60, dtype=torch.long))
     assert field.inside.all()
     true = (points + 0.5) * RESOLUTION @ normal - 4.0
     # Four rounds bring the cell's coordinates to about a hundredth of a cell, and the last one is linear.
     torch.testing.assert_close(field.distance, true, atol=5e-3, rtol=0)
-    torch.testing.assert_close(field.slope, torch.einsum("pxu,x->pu", field.jacobian, normal), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        field.slope, torch.einsum("pxu,x->pu", field.jacobian, normal), atol=1e-4, rtol=0
+    )
 
 
 def test_corners_are_those_that_the_extraction_uses():

@@ -43,7 +43,9 @@ def measured(decoded: SparseTensor, x: SparseTensor, radius: float) -> SurfaceLo
     surface = ball(radius=radius)
     estimates = object_features(surface, x.grid.coordinates.numpy(), RESOLUTION).distances
     latent = SlatDistribution(mean=x, logvar=x)
-    return surface_loss(decoded, latent, join_surfaces([surface], ["ball"]), torch.from_numpy(estimates), CONFIG)
+    return surface_loss(
+        decoded, latent, join_surfaces([surface], ["ball"]), torch.from_numpy(estimates), CONFIG
+    )
 
 
 @pytest.mark.parametrize("levels", [0, 1])
@@ -111,8 +113,21 @@ def test_each_sample_stands_for_itself():
         a, b, c = (getattr(each, field.name) for each in (both, first, second))
         torch.testing.assert_close(a, torch.cat([b, c]), rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(
-        both.weighted(CONFIG), torch.cat([first.weighted(CONFIG), second.weighted(CONFIG)]), rtol=1e-4, atol=1e-6
+        both.weighted(CONFIG),
+        torch.cat([first.weighted(CONFIG), second.weighted(CONFIG)]),
+        rtol=1e-4,
+        atol=1e-6,
     )
+
+
+def test_autocast_changes_nothing():
+    x = coarse(0.3)
+    decoded = true_channels(x, 0.3, 1)
+    plain = measured(decoded, x, 0.3)
+    with torch.autocast("cpu", torch.bfloat16):
+        cast = measured(decoded, x, 0.3)
+    for field in fields(SurfaceLoss):
+        torch.testing.assert_close(getattr(cast, field.name), getattr(plain, field.name), rtol=0, atol=0)
 
 
 def test_a_sample_that_is_not_a_number_can_be_named():

@@ -33,7 +33,8 @@ def flow_config(
             condition_channels=channels,
             blocks=blocks,
             heads=heads,
-            mlp_ratio=4, preconditioned=False,
+            mlp_ratio=4,
+            preconditioned=False,
         ),
         masks=MaskBranchConfig(
             feature_channels=channels,

@@ -10,8 +10,9 @@ from safetensors.torch import load_file, save_file
 from model.config import load_config
 from model.errors import ModelError
 from model.sparse_structure.dual_branch import DualBranchFlow
+from model.weights.published import find_published, import_networks
 from model.weights.safetensors_file import shapes_of
-from model.weights.trellis import find_published, import_published, published_shapes
+from model.weights.trellis import published_shapes, stage_one_networks
 from tests.model.weights.published import (
     CLASSES,
     DECODER,
@@ -30,7 +31,7 @@ PREFIXES = {FLOW: "flow.geometry.", ENCODER: "vae.encoder.", DECODER: "vae.decod
 
 
 def run(source: Path, out: Path, flow=SMALL_FLOW, vae=SMALL_VAE):
-    return import_published(source, flow=flow, vae=vae, out=out)
+    return import_networks(source, stage_one_networks(flow, vae), out)
 
 
 def fails(source: Path, out: Path, *parts: str) -> str:
@@ -106,9 +107,11 @@ def test_single_files_by_name_or_by_the_json_beside_them(tmp_path: Path) -> None
     assert set(report.absent) == {FLOW, ENCODER}
     for suffix in ("safetensors", "json"):
         (tmp_path / f"{ENCODER}_fp16.{suffix}").rename(tmp_path / f"mine.{suffix}")
-    assert find_published(tmp_path / "mine.safetensors").found == {ENCODER: tmp_path / "mine.safetensors"}
+    assert find_published(tmp_path / "mine.safetensors", stage_one_networks(SMALL_FLOW, SMALL_VAE)).found == {
+        ENCODER: tmp_path / "mine.safetensors"
+    }
     (tmp_path / "mine.json").unlink()
-    fails(tmp_path / "mine.safetensors", tmp_path / "b.safetensors", "is not one of the networks of stage 1")
+    fails(tmp_path / "mine.safetensors", tmp_path / "b.safetensors", "is none of the published networks")
 
 
 def test_a_key_too_few_too_many_or_of_another_shape_is_refused_and_listed(tmp_path: Path) -> None:
@@ -143,7 +146,7 @@ def _sparse_published_file(path: Path, name: str) -> None:
 def test_the_published_flow_fits_the_paper_config_and_no_other(tmp_path: Path) -> None:
     path = tmp_path / f"{FLOW}_fp16.safetensors"
     _sparse_published_file(path, FLOW)
-    fails(path, tmp_path / "out.safetensors", "import it with configs/model/paper.yaml")
+    fails(path, tmp_path / "out.safetensors", "import it with configs/model/paper")
     with pytest.raises(ModelError, match="pos_emb differs by 1"):  # zeros: all 489 keys fit, and are read
         run(path, tmp_path / "out.safetensors", PAPER.stage_one.network, PAPER.vae.network)
     listed = json.loads((tmp_path / "out.keys.json").read_text())[FLOW]
@@ -187,7 +190,7 @@ def test_broken_files_are_one_line(tmp_path: Path) -> None:
 def test_sources_without_networks(tmp_path: Path) -> None:
     out = tmp_path / "out.safetensors"
     fails(tmp_path / "none", out, "there is no such file or folder")
-    fails(tmp_path, out, "none of the networks of stage 1", "Download")
+    fails(tmp_path, out, "none of the published networks", "Download")
     write_published(tmp_path)
     (tmp_path / f"{FLOW}_bf16.safetensors").write_bytes(b"")
     fails(tmp_path, out, "twice")

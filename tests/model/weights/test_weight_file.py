@@ -13,7 +13,8 @@ from model.networks.lora import LoraSettings, add_lora
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne
 from model.sparse_structure.vae import StructureVae
-from model.weights.trellis import import_published
+from model.weights.published import import_networks
+from model.weights.trellis import stage_one_networks
 from model.weights.weight_file import (
     GEOMETRY,
     VAE,
@@ -54,7 +55,7 @@ def assert_unchanged(module: nn.Module, before: dict[str, torch.Tensor]) -> None
 def imported(tmp_path: Path) -> tuple[Path, dict[str, dict[str, torch.Tensor]]]:
     written = write_published(tmp_path / "published")
     out = tmp_path / "trellis.safetensors"
-    import_published(tmp_path / "published", flow=SMALL_FLOW, vae=SMALL_VAE, out=out)
+    import_networks(tmp_path / "published", stage_one_networks(SMALL_FLOW, SMALL_VAE), out)
     return out, written
 
 

@@ -1,0 +1,30 @@
+"""The table that ends a training: each figure beside what it has to beat."""
+
+from rich.table import Table
+
+__all__ = ["figures_table"]
+
+# Figure -> the same figure of a guess that needs no network.
+TO_BEAT = {
+    "voxel_iou": ("mean_shape_iou", "mean training shape"),
+    "mask_iou": ("visible_iou", "true visible mask"),
+    "occluded_mask_iou": ("occluded_visible_iou", "true visible mask"),
+}
+
+
+def figures_table(title: str, figures: dict[str, dict[str, float]], caption: str) -> Table:
+    """A row for each figure of each part."""
+    table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
+    for column in ("part", "figure", "value", "to beat", ""):
+        table.add_column(column, justify="right" if column in ("value", "to beat") else "left")
+    baselines = {baseline for baseline, _ in TO_BEAT.values()}
+    for part, values in figures.items():
+        for name, value in values.items():
+            if name in baselines:
+                continue
+            baseline, label = TO_BEAT.get(name, ("", ""))
+            known = baseline in values
+            table.add_row(
+                part, name, f"{value:.3f}", f"{values[baseline]:.3f}" if known else "", label if known else ""
+            )
+    return table

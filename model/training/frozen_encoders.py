@@ -1,0 +1,41 @@
+"""The frozen encoders of pictures and hands that a configuration names."""
+
+from model.config import EncodersConfig, OwnHandEncoder, PackagedHandEncoder
+from model.encoders.cached import CachedEncoder
+from model.encoders.dino import DinoConfig, load_dino
+from model.encoders.efficientnet import load_efficientnet
+from model.encoders.hand import HandEncoder, packaged_hand_net
+from model.encoders.protocol import FeatureEncoder
+from model.encoders.wilor import load_wilor
+from model.errors import ModelError
+
+__all__ = ["given_hand_encoder", "image_encoder", "with_cache"]
+
+
+def image_encoder(config: EncodersConfig) -> FeatureEncoder:
+    """DINOv2 or EfficientNet. ModelError when its weights are missing."""
+    chosen = config.image
+    encoder: FeatureEncoder = (
+        load_dino(chosen) if isinstance(chosen, DinoConfig) else load_efficientnet(chosen)
+    )
+    return with_cache(encoder, config)
+
+
+def given_hand_encoder(config: EncodersConfig) -> FeatureEncoder:
+    """The packaged one or WiLoR. ModelError for the one that stage 1 trains, or when weights are missing."""
+    chosen = config.hand
+    if isinstance(chosen, OwnHandEncoder):
+        raise ModelError(
+            "encoders.hand",
+            "is the hand encoder that stage 1 trains",
+            expected="one that is there already: {packaged_grid: N}, or WiLoR",
+            action="Change it; stage 2 trains no hand encoder.",
+        )
+    if isinstance(chosen, PackagedHandEncoder):
+        return with_cache(HandEncoder(network=packaged_hand_net(), grid=chosen.packaged_grid), config)
+    return with_cache(load_wilor(chosen), config)
+
+
+def with_cache(encoder: FeatureEncoder, config: EncodersConfig) -> FeatureEncoder:
+    """Keeps the features of `cached_views` pictures, of use where crops repeat."""
+    return CachedEncoder(encoder=encoder, max_views=config.cached_views) if config.cached_views else encoder

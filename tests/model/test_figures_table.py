@@ -1,0 +1,24 @@
+"""The table shows a figure beside what it has to beat, and only there."""
+
+from rich.console import Console
+
+from model.figures_table import figures_table
+
+
+def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
+    figures = {
+        "vae": {"voxel_iou": 0.7},
+        "stage_one": {"voxel_iou": 0.66, "mean_shape_iou": 0.32, "mask_iou": 0.71, "visible_iou": 0.87},
+    }
+    console = Console(width=120)
+    with console.capture() as capture:
+        console.print(figures_table("tiny: figures", figures, "caption"))
+    lines = capture.get().splitlines()
+    assert not any("mean_shape_iou" in line or "visible_iou" in line for line in lines)
+    (vae,) = [line for line in lines if "vae" in line]
+    assert "0.700" in vae
+    assert "mean training shape" not in vae
+    (shape,) = [line for line in lines if "0.660" in line]
+    assert "0.320" in shape
+    assert "mean training shape" in shape
+    assert any("0.710" in line and "0.870" in line and "true visible mask" in line for line in lines)
