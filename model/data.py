@@ -197,7 +197,10 @@ def _unchanged(delivery: Any) -> Any:
 def _start_worker(_: int) -> None:
     cv2.setNumThreads(0)  # one thread per loader process, or they fight for the cores
     torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the main process's to handle
+    # Ctrl-C and the scheduler's SIGTERM reach the whole process group, and are the main process's to handle: it saves
+    # and then ends its workers. Should it die, torch's watchdog ends them.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 def _check_shared_memory(config: StreamConfig, world_size: int) -> None:

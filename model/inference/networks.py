@@ -98,8 +98,7 @@ class Networks:
 def open_stage_one(run: Path) -> StageOneRun:
     """ModelError, naming the command that trains it, when the folder holds no trained stage 1."""
     config = _config(run, "stage_one")
-    if not isinstance(config, TrainingConfig):
-        raise _wrong_stage(run, "stage 1")
+    assert isinstance(config, TrainingConfig)  # what trains the part of this name
     recipes = {"vae": config.vae, "hand_encoder": config.hand_encoder, "stage_one": config.stage_one}
     return StageOneRun(
         folder=run,
@@ -114,8 +113,7 @@ def open_stage_one(run: Path) -> StageOneRun:
 def open_stage_two(run: Path) -> StageTwoRun:
     """ModelError, naming the command that trains it, when the folder holds no trained stage 2."""
     config = _config(run, "slat_flow")
-    if not isinstance(config, SlatTrainingConfig):
-        raise _wrong_stage(run, "stage 2")
+    assert isinstance(config, SlatTrainingConfig)
     recipes = {"slat_vae": config.slat_vae.recipe, "slat_flow": config.slat_flow.recipe}
     return StageTwoRun(
         folder=run,
@@ -188,9 +186,3 @@ def _config_of(run: Path) -> str:
     """The configuration that trains a run of this name, as far as there is one."""
     path = Path("configs/model") / f"{run.name}.yaml"
     return str(path) if path.is_file() else "CONFIG"
-
-
-def _wrong_stage(run: Path, wanted: str) -> ModelError:
-    return ModelError(
-        run, "was trained for the other stage", expected=f"a run of {wanted}", action="Name another folder."
-    )

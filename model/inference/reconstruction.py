@@ -111,7 +111,7 @@ def reconstruct(
             frames.source,
             f"no object found in {len(frames)} frame{'s' if len(frames) > 1 else ''}: stage 1 fills no voxel",
             expected="a hand that holds an object",
-            action="Choose other frames, or give a box around hand and object.",
+            action="Choose other frames (--frames), or give a box around hand and object (--box).",
         )
     surface, two = None, networks.stage_two
     if two is not None:

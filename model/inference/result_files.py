@@ -18,14 +18,14 @@ from model.video.mp4 import write_mp4
 __all__ = ["write_result"]
 
 _TURN = TurntableConfig(
-    frames=48,
-    size_px=320,
+    frames=36,
+    size_px=256,
     supersampling=2,
     fov_rad=40 * pi / 180,
     elevation_rad=20 * pi / 180,
     shading=Shading(two_sided=False, ambient=0.35, background_rgb=(0.93, 0.93, 0.93)),
 )
-_TURN_FPS = 24.0
+_TURN_FPS = 18.0
 _TILE_PX = 256
 _VOXEL_GREY = 0.62  # stage 1 says nothing about colours
 

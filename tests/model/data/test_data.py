@@ -1,8 +1,11 @@
 """The stream over real shards: exact resume, held-out cameras, what is read, and what goes wrong."""
 
+import os
+import signal
 from dataclasses import fields, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -114,6 +117,20 @@ def test_same_batches_with_loader_processes(balls):
     expected = take(ShardStream(stream_config(balls)), 5)
     for batch, again in zip(expected, take(ShardStream(stream_config(balls, workers=2)), 5)):
         assert_same(batch, again)
+
+
+def test_a_terminate_signal_to_the_whole_group_leaves_loaders_to_the_main_process(balls):
+    """A scheduler signals all processes; the trainer saves and needs no loader to die under it."""
+    stream = ShardStream(stream_config(balls, workers=1))
+    batches = iter(stream)
+    first = next(batches)
+    loader: Any = stream._loader
+    for worker in loader._iterator._workers:
+        os.kill(worker.pid, signal.SIGTERM)
+    more = list(islice(batches, 6))
+    assert len(more) == 6
+    assert first.ids != more[0].ids
+    stream.close()
 
 
 def test_one_two_and_one_ranks_give_the_batches_of_an_uninterrupted_run(balls):

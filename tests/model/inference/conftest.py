@@ -7,10 +7,10 @@ import pytest
 
 from tests.model.data.balls import write_balls
 from tests.model.inference.small_networks import (
+    fill_some,
     small_stage_one,
     small_stage_two,
-    train_stage_one,
-    train_stage_two,
+    train_small,
 )
 
 
@@ -27,8 +27,10 @@ class Runs:
 def runs(tmp_path_factory) -> Runs:
     root = tmp_path_factory.mktemp("runs")
     dataset = write_balls(root / "balls", splits=[["train", "train"]], n_frames=4)
-    return Runs(
+    runs = Runs(
         dataset=dataset,
-        one=train_stage_one(root / "one", small_stage_one(dataset)),
-        two=train_stage_two(root / "two", small_stage_two(dataset)),
+        one=train_small(root / "one", small_stage_one(dataset)),
+        two=train_small(root / "two", small_stage_two(dataset)),
     )
+    fill_some(runs.one)
+    return runs
