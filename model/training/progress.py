@@ -17,6 +17,7 @@ class TrainingProgress:
 
     def __init__(self, name: str, *, enabled: bool) -> None:
         self._name, self._enabled = name, enabled
+        self._lines = 0
         self._console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -35,8 +36,9 @@ class TrainingProgress:
         waiting = f", waiting {report.waiting_share:.0%}" if report.waiting_share > 0.05 else ""
         line = f"{self._name}: {losses}, {report.samples_per_s:.1f} samples/s{waiting}"
         self._bar.update(self._task, completed=report.step, total=report.steps, description=line)
-        every = max(report.steps // self.LINES, 1)
-        if self._enabled and not self._console.is_terminal and report.step % every == 0:
+        lines = report.step * self.LINES // report.steps
+        if self._enabled and not self._console.is_terminal and lines > self._lines:
+            self._lines = lines
             self._console.print(f"{line}, step {report.step} of {report.steps}", soft_wrap=True)
 
     def __enter__(self) -> "TrainingProgress":
