@@ -13,7 +13,7 @@ from shards.geometry import intrinsics_from_fov, look_at, project_points, transf
 __all__ = ["comparison"]
 
 _TILE_PX = 192
-_FOV_RAD = 0.55  # the whole canonical cube is in the picture
+_FOV_RAD = 0.42  # all but the outermost corners of the canonical cube
 _DOT_PX = 2  # half-width
 _ROWS = 4
 _SHADING = Shading(two_sided=False, ambient=0.35, background_rgb=(1.0, 1.0, 1.0))
@@ -46,11 +46,12 @@ def _points_picture(
     points_cam = transform_points(T_cam_from_canonical, truth.points.astype(np.float64))
     normals_cam = truth.normals @ T_cam_from_canonical[:3, :3].T
     facing = -np.einsum("px,px->p", normals_cam, points_cam) / np.linalg.norm(points_cam, axis=1)
-    seen = np.flatnonzero(facing > 0)
+    pixels = project_points(points_cam, K)
+    seen = np.flatnonzero((facing > 0) & ((pixels >= 0) & (pixels < _TILE_PX)).all(axis=1))
     seen = seen[np.argsort(-points_cam[seen, 2])]
     shade = _SHADING.ambient + (1.0 - _SHADING.ambient) * facing[seen, None]
     colors = np.round(truth.colors[seen] * shade ** (1 / 2.2)).astype(np.uint8)
-    columns, rows = np.floor(project_points(points_cam[seen], K)).astype(int).T
+    columns, rows = np.floor(pixels[seen]).astype(int).T
     picture = _blank()
     for row, column, color in zip(rows, columns, colors):
         picture[
