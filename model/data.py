@@ -41,6 +41,8 @@ __all__ = [
 ]
 
 _START = StreamState(epoch=0, consumed=0)
+# 8,192 points, normals and colours, and 12,288 distances with their points, as datagen writes them; about.
+_SURFACE_BYTES = 8192 * (2 * 12 + 12) + 12288 * 16
 
 
 class ShardStream:
@@ -209,7 +211,8 @@ def _check_shared_memory(config: StreamConfig, world_size: int) -> None:
         return
     view = config.image_size**2 * (3 * 4 + 3)
     samples = -(-config.batch_size // world_size)
-    needed = samples * (config.views[1] * view + OCCUPANCY_VOXELS**3)
+    surface = _SURFACE_BYTES if config.surface else 0
+    needed = samples * (config.views[1] * view + OCCUPANCY_VOXELS**3 + surface)
     needed *= config.workers * config.prefetch_batches + 1
     free = 0
     with contextlib.suppress(OSError):

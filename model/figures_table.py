@@ -11,18 +11,19 @@ TO_BEAT = {
     "occluded_mask_iou": ("occluded_visible_iou", "true visible mask"),
 }
 
+MEAN_LATENT = "mean_latent_"  # of any figure of stage 2
+
 
 def figures_table(title: str, figures: dict[str, dict[str, float]], caption: str) -> Table:
     """A row for each figure of each part."""
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
     for column in ("part", "figure", "value", "to beat", ""):
         table.add_column(column, justify="right" if column in ("value", "to beat") else "left")
-    baselines = {baseline for baseline, _ in TO_BEAT.values()}
     for part, values in figures.items():
         for name, value in values.items():
-            if name in baselines:
+            if name in {baseline for baseline, _ in TO_BEAT.values()} or name.startswith(MEAN_LATENT):
                 continue
-            baseline, label = TO_BEAT.get(name, ("", ""))
+            baseline, label = TO_BEAT.get(name, (f"{MEAN_LATENT}{name}", "mean latent"))
             known = baseline in values
             table.add_row(
                 part, name, f"{value:.3f}", f"{values[baseline]:.3f}" if known else "", label if known else ""

@@ -16,7 +16,7 @@ from torch import Tensor
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
 from model.surface.fields import CORNERS, split_channels
-from model.surface.lattice import _LARGEST_MOVE as LARGEST_MOVE
+from model.surface.lattice import LARGEST_MOVE
 
 __all__ = ["DecodedLattice", "FieldSamples", "decoded_lattice"]
 

@@ -8,10 +8,10 @@ from scipy import ndimage
 
 from model.surface.fields import CORNERS, SurfaceFields
 
-__all__ = ["CornerLattice", "SignedLattice", "corner_lattice", "fill_uncovered"]
+__all__ = ["LARGEST_MOVE", "CornerLattice", "SignedLattice", "corner_lattice", "fill_uncovered"]
 
 # TRELLIS lets corners move by (1 - 1e-8) of half a cell, which float32 rounds to 1: two neighbours may then meet.
-_LARGEST_MOVE = 0.5 * (1.0 - 1e-3)
+LARGEST_MOVE = 0.5 * (1.0 - 1e-3)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ def corner_lattice(fields: SurfaceFields, margin: int) -> CornerLattice:
     means = sums / share
 
     lattice_points = np.stack(np.unravel_index(flat, shape), axis=1) + origin
-    moved = lattice_points + _LARGEST_MOVE * np.tanh(means[1:4].T)
+    moved = lattice_points + LARGEST_MOVE * np.tanh(means[1:4].T)
     return CornerLattice(
         resolution=fields.resolution,
         origin=origin,

@@ -22,3 +22,16 @@ def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
     assert "0.320" in shape
     assert "mean training shape" in shape
     assert any("0.710" in line and "0.870" in line and "true visible mask" in line for line in lines)
+
+
+def test_stage_two_has_the_mean_latent_to_beat() -> None:
+    console = Console(width=120)
+    with console.capture() as capture:
+        console.print(
+            figures_table("t", {"slat_flow": {"f_5mm": 98.9, "mean_latent_f_5mm": 92.1}}, "caption")
+        )
+    rows = [line for line in capture.get().splitlines() if "slat_flow" in line]
+    assert len(rows) == 1
+    assert "98.900" in rows[0]
+    assert "92.100" in rows[0]
+    assert "mean latent" in rows[0]
