@@ -67,7 +67,7 @@ def train(what: str, config_path: Path, out: Path | None) -> None:
     \b
     Example:
       forehoi train configs/model/tiny.yaml
-      forehoi train hand_encoder --config configs/model/tiny.yaml
+      forehoi train hand_encoder --config configs/model/hands.yaml
     """
     one_part = what in (*PARTS, *SLAT_PARTS)
     path = config_path if one_part else Path(what)

@@ -33,7 +33,9 @@ __all__ = [
 N_JOINTS = 21
 _STRIDES = (2, 4, 8, 16)
 _WEIGHTS, _CONFIG = "hand_encoder.safetensors", "hand_encoder.json"
-_ACTION = "Make it with `forehoi train hand_encoder`, or give the folder of one that is made."
+_ACTION = (
+    "Make it with `forehoi train hand_encoder` (configs/model/hands.yaml), or give the folder of a made one."
+)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,14 +2,14 @@
 
 Values of `VaeConfig`; `paper` has the parameters of ss_enc_conv3d_16l8 and ss_dec_conv3d_16l8:
 
-| field           | paper          | small         | tiny     |
-|-----------------|----------------|---------------|----------|
-| patch           | 1              | 2             | 4        |
-| channels        | (32, 128, 512) | (64, 128)     | (32, 64) |
-| latent_channels | 8              | 8             | 8        |
-| residual_blocks | (2, 2, 2)      | (2, 2)        | (1, 1)   |
-| middle_blocks   | 2              | 2             | 1        |
-| latent of 64³   | 16³            | 16³           | 8³       |
+| field           | paper          | small         | tiny          |
+|-----------------|----------------|---------------|---------------|
+| patch           | 1              | 2             | 4             |
+| channels        | (32, 128, 512) | (64, 128)     | (32, 64, 128) |
+| latent_channels | 8              | 8             | 16            |
+| residual_blocks | (2, 2, 2)      | (2, 2)        | (1, 1, 1)     |
+| middle_blocks   | 2              | 2             | 1             |
+| latent of 64³   | 16³            | 16³           | 4³            |
 
 Almost all the time of a CPU would go into the 64³ level, so `tiny` and `small` cut the grid into patches first:
 a training step of `tiny` takes a fifth of the time of four levels from 64³ down.

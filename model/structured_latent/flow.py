@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from model.errors import ModelError
+from model.flow import preconditioned_velocity
 from model.networks.embeddings import TimestepEmbedder
 from model.networks.sparse.blocks import SparseResBlock3d
 from model.networks.sparse.resampling import mean_pool, unpool
@@ -33,7 +34,8 @@ class SlatFlowConfig:
     """Sizes. `patch` = 2 ** len(io_channels): each level of residual blocks halves the resolution.
 
     `pool_pseudo_count`: 1 for weights that began as TRELLIS's, else 0 (`mean_pool`). `checkpoint_blocks`
-    recomputes each transformer block in the backward pass: less memory, more time.
+    recomputes each transformer block in the backward pass: less memory, more time. `preconditioned`: the head gives
+    what `preconditioned_velocity` lacks, which small networks learn sooner; false for published weights.
     """
 
     resolution: int
@@ -47,6 +49,7 @@ class SlatFlowConfig:
     io_channels: tuple[int, ...]
     pool_pseudo_count: int
     checkpoint_blocks: bool
+    preconditioned: bool
 
     def __post_init__(self) -> None:
         if self.channels % self.heads:
@@ -123,7 +126,12 @@ class SlatFlow(nn.Module):
             h = _beside(h, skips.pop())
             # The first block of a level reads the coarse grid and works on the fine one.
             h = block(unpool(h, skips[-1].grid) if i % 2 == 0 else h, t_embedding)
-        return h.with_features(self.out_layer(layer_norm(h.features, eps=1e-5)))
+        output = self.out_layer(layer_norm(h.features, eps=1e-5))
+        if self.config.preconditioned:
+            output = preconditioned_velocity(
+                x_t.features, output.to(x_t.features.dtype), t[h.grid.batch_index]
+            )
+        return h.with_features(output)
 
     def _run(self, block: nn.Module, h: SparseTensor, *condition: Tensor) -> SparseTensor:
         if self.config.checkpoint_blocks and torch.is_grad_enabled():

@@ -1,6 +1,7 @@
 """The parts of stage 1, trained one after the other: VAE, hand encoder, dual-branch flow.
 
 RUN/vae, RUN/hand_encoder, RUN/stage_one    checkpoints, TensorBoard logs, figures.json
+RUN/stage_one/facts.safetensors    what stage 1 needs of the training data when it is used
 RUN/hand_encoder/hand_encoder.{safetensors,json}    its averaged weights in float16, for `load_hand_net`
 """
 
@@ -36,6 +37,8 @@ from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.sparse_structure.vae_training import VaeTask
+from model.training.checkpoint import latest_checkpoint
+from model.training.facts import TrainingFacts, facts_of_run, load_facts
 from model.training.frozen_encoders import given_hand_encoder, image_encoder, with_cache
 from model.training.identity import part_sha256
 from model.training.part_run import load_part, part_data, run_part
@@ -85,15 +88,17 @@ def train_part(
 
 
 def _export_hand_net(network: HandNet, config: TrainingConfig, folder: Path) -> None:
-    """The averaged weights, for `load_hand_net`; once."""
-    if not (folder / "hand_encoder" / "hand_encoder.safetensors").exists():
+    """The averaged weights, for `load_hand_net`; only when the run is newer than what is there."""
+    export = folder / "hand_encoder" / "hand_encoder.safetensors"
+    newest = latest_checkpoint(folder / "hand_encoder" / "checkpoints")
+    if newest is not None and (not export.exists() or export.stat().st_mtime < newest.stat().st_mtime):
         _load(folder, "hand_encoder", config, network)
         save_hand_net(network, folder / "hand_encoder", dtype=torch.float16)
 
 
 def load_stage_one(config: TrainingConfig, folder: Path, device: torch.device) -> StageOneTask:
     """Stage 1 with the averaged weights of its newest checkpoint, for inference."""
-    task = _stage_one_task(config, folder, device)
+    task = _stage_one_task(config, folder, device, load_facts(folder / "stage_one"))
     _load(folder, "stage_one", config, task.module)
     task.module.to(device).eval()
     return task
@@ -120,13 +125,17 @@ def _task(name: str, config: TrainingConfig, folder: Path, device: torch.device)
     if name == "hand_encoder":
         assert config.hand_encoder is not None  # else there is no recipe
         return HandTask(network=HandNet(config.hand_encoder.network), config=config.hand_encoder.loss)
-    return _stage_one_task(config, folder, device)
+    return _stage_one_task(config, folder, device, None)
 
 
-def _stage_one_task(config: TrainingConfig, folder: Path, device: torch.device) -> StageOneTask:
+def _stage_one_task(
+    config: TrainingConfig, folder: Path, device: torch.device, facts: TrainingFacts | None
+) -> StageOneTask:
+    """`facts` None: those of a run that begins or goes on, measured once on the training data."""
     part = config.stage_one
     vae = _vae(config, folder).to(device)
-    shapes = _training_shapes(config)
+    if facts is None:
+        facts = facts_of_run(folder / "stage_one", lambda: _measured(config, vae, device))
     image, hand = image_encoder(config.encoders), _hand_encoder(config, folder)
     image.to(device, torch.float32)
     hand.to(device, torch.float32)
@@ -154,9 +163,9 @@ def _stage_one_task(config: TrainingConfig, folder: Path, device: torch.device) 
             time=part.time,
             sampler=part.sampler,
             guidance=Guidance(strength={"geometry": part.guidance_strength}, interval=part.guidance_interval),
-            latent_scale=part.start.latent_scale if part.start else _latent_scale(vae, shapes, device),
+            latent_scale=facts.latent_scale,
         ),
-        mean_shape=mean_shape(shapes),
+        mean_shape=facts.mean_shape,
     )
 
 
@@ -176,6 +185,14 @@ def _vae(config: TrainingConfig, folder: Path) -> StructureVae:
     else:
         _load(folder, "vae", config, vae)
     return vae.eval().requires_grad_(False)
+
+
+def _measured(config: TrainingConfig, vae: StructureVae, device: torch.device) -> TrainingFacts:
+    shapes, start = _training_shapes(config), config.stage_one.start
+    return TrainingFacts(
+        latent_scale=start.latent_scale if start else _latent_scale(vae, shapes, device),
+        mean_shape=mean_shape(shapes),
+    )
 
 
 def _training_shapes(config: TrainingConfig) -> Bool[Tensor, "shape 64 64 64"]:

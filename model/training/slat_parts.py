@@ -3,7 +3,6 @@
 RUN/slat_vae, RUN/slat_flow    checkpoints, TensorBoard logs, figures.json
 """
 
-import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from model.structured_latent.object_input import ObjectInputs
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.training.frozen_encoders import given_hand_encoder, image_encoder
+from model.training.identity import deciding_data, deciding_recipe, encoder_digests, sha256_of
 from model.training.part_run import load_part, part_data, run_part
 from model.training.task import Task
 from model.training.trainer import StepReport
@@ -79,11 +79,13 @@ def load_slat_flow(config: SlatTrainingConfig, folder: Path, device: torch.devic
 
 def slat_part_sha256(name: str, config: SlatTrainingConfig) -> str:
     """Changes with anything that decides what training a part gives. ModelError when a weight file is missing."""
-    texts = [as_yaml(config.slat_vae), as_yaml(config.data)]
+    vae = replace(config.slat_vae, recipe=deciding_recipe(config.slat_vae.recipe))
+    texts = [as_yaml(vae), as_yaml(deciding_data(config.data))]
     if name == SLAT_FLOW:
-        texts += [as_yaml(config.slat_flow), as_yaml(config.encoders)]
-        texts += [weights_sha256(config.slat_flow.start)] if config.slat_flow.start is not None else []
-    return hashlib.sha256("\n".join(texts).encode()).hexdigest()
+        flow = replace(config.slat_flow, recipe=deciding_recipe(config.slat_flow.recipe))
+        texts += [as_yaml(flow), as_yaml(config.encoders), *encoder_digests(config.encoders)]
+        texts += [weights_sha256(flow.start)] if flow.start is not None else []
+    return sha256_of(*texts)
 
 
 def _vae_task(config: SlatTrainingConfig) -> SlatVaeTask:

@@ -191,6 +191,7 @@ def _step(
     """One optimiser step over `accumulate` global batches."""
     config, accelerator = run.config, run.accelerator
     sums: dict[str, torch.Tensor] = {}
+    ids: list[str] = []
     for part in range(config.accumulate):
         with clock.waiting():
             placed = next(batches)
@@ -200,12 +201,19 @@ def _step(
         with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=bfloat16):
             losses = run.task.loss(batch, generators)
         _require_finite(run, losses, batch, step)
+        ids += batch.ids
         (losses.total / config.accumulate).backward()
         for name, value in {"loss": losses.total, **losses.parts}.items():
             sums[name] = sums.get(name, 0.0) + value.detach().float() / config.accumulate
         clock.count(len(placed.batch.ids) * accelerator.num_processes)
     _average_gradients(run)
     norm = nn.utils.clip_grad_norm_(run.parameters, run.optimizer_config.clip_norm)
+    if not bool(torch.isfinite(norm)):  # the same on all ranks; before it reaches weights and checkpoints
+        raise NonFiniteLossError(
+            f"step {step}: the gradient is {float(norm)} though the loss is finite; samples of this rank: "
+            f"{', '.join(ids)}; expected a finite number. Look at these samples, or lower optimizer.learning_rate; "
+            f"training goes on from the newest checkpoint in {run.checkpoints}"
+        )
     rate = run.optimizer_config.rate(step, config.steps)
     for group in run.optimizer.param_groups:
         group["lr"] = rate

@@ -96,6 +96,13 @@ def slat_networks(flow: SlatFlowConfig, vae: SlatVaeConfig) -> tuple[PublishedNe
             expected="1: the published flow was trained with sums divided by count + 1",
             action="Set it to 1 in the configuration that imports.",
         )
+    if flow.preconditioned:
+        raise ModelError(
+            _WHERE,
+            "preconditioned is true",
+            expected="false: the published flow gives the velocity itself",
+            action="Set it to false in the configuration that imports.",
+        )
     with torch.device("meta"):
         modules = {
             "flow": SlatFlow(flow),

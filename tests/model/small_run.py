@@ -31,7 +31,13 @@ def small_settings(dataset: Path) -> dict[str, Any]:
     for part in ("vae", "hand_encoder", "stage_one"):
         recipe = config[part]["recipe"]
         recipe |= {"batch_size": 2, "views": [1, 2]}
-        recipe["trainer"] |= {"steps": STEPS, "checkpoint_every": 1, "validate_every": STEPS, "log_every": 1}
+        recipe["trainer"] |= {
+            "steps": STEPS,
+            "checkpoint_every": 1,
+            "keep_checkpoints": 2,
+            "validate_every": STEPS,
+            "log_every": 1,
+        }
     return config
 
 

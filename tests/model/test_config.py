@@ -41,8 +41,8 @@ def test_networks_can_be_built_and_a_latent_decodes_to_64_voxels(name):
     assert logits.shape == (1, 64, 64, 64)
 
 
-def test_three_sizes_are_published():
-    assert set(NAMES) == {"tiny", "small", "paper"}
+def test_three_sizes_and_the_packaged_hand_encoder_are_published():
+    assert set(NAMES) == {"hands", "tiny", "small", "paper"}
 
 
 def test_paper_is_the_setting_of_section_4_1():

@@ -32,6 +32,7 @@ FLOW = SlatFlowConfig(
     io_channels=(8,),
     pool_pseudo_count=0,
     checkpoint_blocks=False,
+    preconditioned=False,
 )
 TWO_LEVELS = replace(FLOW, patch=4, io_channels=(8, 16))
 

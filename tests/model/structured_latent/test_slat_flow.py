@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d, conv3d, interpolate, layer_norm, silu
 
 from model.errors import ModelError
+from model.flow import preconditioned_velocity
 from model.networks.embeddings import sincos_position_embedding
 from model.networks.lora import (
     LoraSettings,
@@ -238,6 +239,7 @@ def test_paper_adapters_are_those_of_stage_one() -> None:
         io_channels=(128,),
         pool_pseudo_count=1,
         checkpoint_blocks=True,
+        preconditioned=False,
     )
     with torch.device("meta"):
         flow = SlatFlow(paper)
@@ -280,3 +282,14 @@ def test_adapters_start_without_effect_train_merge_and_travel(tmp_path: Path) ->
     merge_lora(flow)
     assert set(flow.state_dict()) == names
     torch.testing.assert_close(flow(x, *condition).features, adapted, atol=1e-4, rtol=1e-4)
+
+
+def test_a_preconditioned_flow_adds_what_the_noise_tells() -> None:
+    plain = trained(SlatFlow(FLOW))
+    fitted = SlatFlow(replace(FLOW, preconditioned=True)).to(torch.float64)
+    fitted.load_state_dict(plain.state_dict())
+    x_t, (t, contexts, weights) = voxels(0.2, 4), _condition(views=2)
+    output = plain(x_t, t, contexts, weights)
+    found = fitted(x_t, t, contexts, weights)
+    expected = preconditioned_velocity(x_t.features, output.features, t[x_t.grid.batch_index])
+    torch.testing.assert_close(found.features, expected)

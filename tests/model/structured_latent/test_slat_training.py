@@ -47,6 +47,7 @@ FLOW = SlatFlowConfig(
     io_channels=(8, 16),
     pool_pseudo_count=0,
     checkpoint_blocks=False,
+    preconditioned=False,
 )
 LOSS = SurfaceLossConfig(
     distance=1.0, surface=0.3, normal=0.1, corner=0.3, color=1.0, deformation=1.0, kl=1e-4, truncation=1.0

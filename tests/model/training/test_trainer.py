@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -152,6 +153,35 @@ def test_nan_stops_with_the_samples_named_and_the_last_good_state_kept(tmp_path)
         run(tmp_path, settings(20), source=ToySource(4, poison=29))
     state = read_state(latest_checkpoint(tmp_path / "checkpoints"))
     assert state.step == 4
+    assert all(torch.isfinite(value).all() for value in tensors(tmp_path).values())
+
+
+class _GradientOverflows(ToyTask):
+    """The loss is finite, its gradient at step 5 is not: sqrt at zero."""
+
+    calls = 0
+
+    def loss(self, batch, generators):
+        losses = super().loss(batch, generators)
+        self.calls += 1
+        if self.calls <= 5:
+            return losses
+        parameter = next(self.module.parameters())
+        return replace(losses, total=losses.total + (0.0 * parameter.sum()).sqrt())
+
+
+def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_path):
+    with pytest.raises(NonFiniteLossError, match=r"step 5: the gradient is nan .*toy:1:.*newest checkpoint"):
+        train(
+            _GradientOverflows(),
+            ToySource(4),
+            settings(20),
+            OPTIMIZER,
+            folder=tmp_path,
+            config_yaml="toy",
+            config_sha256="toy",
+        )
+    assert read_state(latest_checkpoint(tmp_path / "checkpoints")).step == 4
     assert all(torch.isfinite(value).all() for value in tensors(tmp_path).values())
 
 

@@ -53,6 +53,7 @@ PAPER_FLOW = SlatFlowConfig(
     io_channels=(128,),
     pool_pseudo_count=1,
     checkpoint_blocks=True,
+    preconditioned=False,
 )
 PAPER_VAE = SlatVaeConfig(
     feature_channels=1024,
@@ -283,3 +284,8 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 def test_a_flow_that_pools_otherwise_cannot_take_the_published_weights() -> None:
     with pytest.raises(ModelError, match="pool_pseudo_count is 0"):
         slat_networks(replace(SMALL_FLOW, pool_pseudo_count=0), SMALL_VAE)
+
+
+def test_a_preconditioned_flow_cannot_take_the_published_weights() -> None:
+    with pytest.raises(ModelError, match="preconditioned is true"):
+        slat_networks(replace(SMALL_FLOW, preconditioned=True), SMALL_VAE)
