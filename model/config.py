@@ -40,6 +40,9 @@ __all__ = [
     "as_yaml",
     "load_config",
     "parse_config",
+    "require_held_out",
+    "require_trainable_adapter",
+    "require_unconditional",
 ]
 
 
@@ -125,6 +128,12 @@ class StageOnePart:
     recipe: Recipe
 
     def __post_init__(self) -> None:
+        if self.beta < 0 or not 0 <= self.drop_condition < 1:
+            raise ValueError(
+                f"beta is {self.beta}, drop_condition {self.drop_condition}: expected beta >= 0 and a share below 1"
+            )
+        require_trainable_adapter(self.lora)
+        require_unconditional(self.guidance_strength, self.drop_condition)
         if self.lora is not None and self.start is None:
             raise ValueError(
                 "lora adapts weights that are there, and start is null: expected a file to start from; "
@@ -146,6 +155,10 @@ class ValidationConfig:
     samples_per_motion: int  # each with its own views
     batches: int  # at most
 
+    def __post_init__(self) -> None:
+        if min(self.views, self.batch_size, self.samples_per_motion, self.batches) < 1:
+            raise ValueError(f"a number in {self} is below 1: expected at least one of each")
+
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig:
@@ -160,6 +173,7 @@ class TrainingConfig:
     stage_one: StageOnePart
 
     def __post_init__(self) -> None:
+        require_held_out(self.data, self.validation)
         network, image = self.stage_one.network, self.encoders.image
         grid = getattr(image, "grid", None)
         if grid is not None and network.masks.grid != grid:
@@ -180,6 +194,36 @@ class TrainingConfig:
                 if own
                 else "hand_encoder is trained and encoders.hand uses another: expected hand_encoder to be null"
             )
+
+
+def require_held_out(data: StreamConfig, validation: ValidationConfig) -> None:
+    """ValueError: data that end, or figures on what is trained on."""
+    if not data.endless:
+        raise ValueError(
+            "data.endless is false: training draws batches for as many steps as it takes; expected true"
+        )
+    if validation.split == data.split and data.cameras != "train":
+        raise ValueError(
+            f"validation.split is that of the training and data.cameras is {data.cameras}: expected cameras: train, "
+            "so that figures are of cameras that were not trained on, or another split"
+        )
+
+
+def require_trainable_adapter(lora: LoraSettings | None) -> None:
+    """ValueError for dropout: all randomness of a step is drawn from its own generators, or no resume is exact."""
+    if lora is not None and lora.dropout > 0:
+        raise ValueError(
+            f"lora.dropout is {lora.dropout}: expected 0, as in the paper; a resume would not be exact"
+        )
+
+
+def require_unconditional(guidance_strength: float, drop_condition: float) -> None:
+    """ValueError: guidance by a velocity that is never trained."""
+    if guidance_strength != 0 and drop_condition == 0:
+        raise ValueError(
+            f"guidance_strength is {guidance_strength} and drop_condition 0: guidance needs the velocity without a "
+            "condition; expected drop_condition > 0, or guidance_strength 0"
+        )
 
 
 def load_config(path: Path) -> TrainingConfig:

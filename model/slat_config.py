@@ -5,7 +5,15 @@ from pathlib import Path
 
 import yaml
 
-from model.config import EncodersConfig, Recipe, TrainingConfig, ValidationConfig
+from model.config import (
+    EncodersConfig,
+    Recipe,
+    TrainingConfig,
+    ValidationConfig,
+    require_held_out,
+    require_trainable_adapter,
+    require_unconditional,
+)
 from model.errors import ModelError
 from model.flow import LogitNormalTime, SamplerSettings, UniformTime
 from model.networks.lora import LoraSettings
@@ -50,6 +58,10 @@ class SlatFlowPart:
     recipe: Recipe
 
     def __post_init__(self) -> None:
+        if not 0 <= self.drop_condition < 1:
+            raise ValueError(f"drop_condition is {self.drop_condition}: expected a share below 1")
+        require_trainable_adapter(self.lora)
+        require_unconditional(self.guidance_strength, self.drop_condition)
         if self.lora is not None and self.start is None:
             raise ValueError(
                 "lora adapts weights that are there, and start is null: expected a file to start from; "
@@ -70,6 +82,7 @@ class SlatTrainingConfig:
     slat_flow: SlatFlowPart
 
     def __post_init__(self) -> None:
+        require_held_out(self.data, self.validation)
         vae, flow = self.slat_vae.network, self.slat_flow.network
         if vae.feature_channels != FEATURE_CHANNELS:
             raise ValueError(

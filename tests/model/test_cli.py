@@ -168,7 +168,7 @@ def test_a_missing_column(tmp_path):
 
 def test_the_paper_without_its_weights_says_how_to_make_them(dataset, tmp_path, monkeypatch):
     settings = yaml.safe_load((ROOT / "configs" / "model" / "paper.yaml").read_text())
-    settings["data"] |= {"datasets": [str(dataset)], "workers": 0}
+    settings["data"] |= {"datasets": [str(dataset)], "workers": 0, "cameras": "train"}
     settings["stage_one"]["recipe"] |= {"views": [1, 2]}
     settings["validation"] |= {"views": 1, "split": "train"}
     monkeypatch.chdir(tmp_path)

@@ -1,5 +1,6 @@
 """The published configurations: complete, and what they say of their networks."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,12 +10,14 @@ from model.config import ImportedVae, TrainingConfig, as_yaml, load_config, pars
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.dino import DinoConfig
 from model.encoders.wilor import WilorConfig
+from model.errors import ModelError
 from model.flow import UniformTime
 from model.networks.lora import LoraSettings, add_lora
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne
 from model.sparse_structure.vae import StructureVae
 from model.training.parts import trained_parts
+from shards.settings import SettingsError
 
 FOLDER = Path(__file__).resolve().parents[2] / "configs" / "model"
 NAMES = sorted(path.stem for path in FOLDER.glob("*.yaml") if not path.stem.endswith("_slat"))
@@ -100,3 +103,29 @@ def test_small_needs_no_weights_of_others():
     with torch.device("meta"):
         flow = DualBranchFlow(config.stage_one.network)
     assert sum(p.numel() for p in flow.parameters()) == pytest.approx(19e6, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "expected"),
+    [
+        ("endless: true", "endless: false", "data.endless is false"),
+        ("cameras: train", "cameras: all", "data.cameras is all"),
+        ("drop_condition: 0.1", "drop_condition: 1.7", "a share below 1"),
+        ("drop_condition: 0.1", "drop_condition: -0.1", "a share below 1"),
+        ("beta: 1.0", "beta: -1.0", "beta >= 0"),
+        ("batches: 8", "batches: 0", "below 1"),
+    ],
+)
+def test_what_cannot_train_or_measure_is_refused(old, new, expected):
+    text = (FOLDER / "tiny.yaml").read_text()
+    assert text.count(old) == 1
+    with pytest.raises((ModelError, SettingsError), match=expected):
+        parse_config(text.replace(old, new), where="tiny")
+
+
+def test_guidance_needs_a_dropped_condition_and_adapters_no_dropout():
+    part = loaded("paper").stage_one
+    with pytest.raises(ValueError, match="drop_condition > 0"):
+        replace(part, drop_condition=0.0)
+    with pytest.raises(ValueError, match="a resume would not be exact"):
+        replace(part, lora=LoraSettings(rank=64, alpha=128, dropout=0.1))
