@@ -40,9 +40,11 @@ __all__ = [
     "as_yaml",
     "load_config",
     "parse_config",
+    "parse_yaml",
+    "read_yaml",
+    "require_adapter",
+    "require_condition",
     "require_held_out",
-    "require_trainable_adapter",
-    "require_unconditional",
 ]
 
 
@@ -128,17 +130,10 @@ class StageOnePart:
     recipe: Recipe
 
     def __post_init__(self) -> None:
-        if self.beta < 0 or not 0 <= self.drop_condition < 1:
-            raise ValueError(
-                f"beta is {self.beta}, drop_condition {self.drop_condition}: expected beta >= 0 and a share below 1"
-            )
-        require_trainable_adapter(self.lora)
-        require_unconditional(self.guidance_strength, self.drop_condition)
-        if self.lora is not None and self.start is None:
-            raise ValueError(
-                "lora adapts weights that are there, and start is null: expected a file to start from; "
-                "name one (`forehoi weights import`), or set lora to null"
-            )
+        if self.beta < 0:
+            raise ValueError(f"beta is {self.beta}: expected beta >= 0")
+        require_condition(self.drop_condition, self.guidance_strength)
+        require_adapter(self.lora, starts=self.start is not None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,16 +204,28 @@ def require_held_out(data: StreamConfig, validation: ValidationConfig) -> None:
         )
 
 
-def require_trainable_adapter(lora: LoraSettings | None) -> None:
-    """ValueError for dropout: all randomness of a step is drawn from its own generators, or no resume is exact."""
-    if lora is not None and lora.dropout > 0:
+def require_adapter(lora: LoraSettings | None, *, starts: bool) -> None:
+    """ValueError: adapters on nothing, or with dropout.
+
+    All randomness of a step is drawn from its own generators, or no resume would be exact.
+    """
+    if lora is None:
+        return
+    if lora.dropout > 0:
         raise ValueError(
             f"lora.dropout is {lora.dropout}: expected 0, as in the paper; a resume would not be exact"
         )
+    if not starts:
+        raise ValueError(
+            "lora adapts weights that are there, and start is null: expected a file to start from; "
+            "name one (`forehoi weights import`), or set lora to null"
+        )
 
 
-def require_unconditional(guidance_strength: float, drop_condition: float) -> None:
-    """ValueError: guidance by a velocity that is never trained."""
+def require_condition(drop_condition: float, guidance_strength: float) -> None:
+    """ValueError: no share, or guidance by a velocity that is never trained."""
+    if not 0 <= drop_condition < 1:
+        raise ValueError(f"drop_condition is {drop_condition}: expected a share below 1")
     if guidance_strength != 0 and drop_condition == 0:
         raise ValueError(
             f"guidance_strength is {guidance_strength} and drop_condition 0: guidance needs the velocity without a "
@@ -226,8 +233,8 @@ def require_unconditional(guidance_strength: float, drop_condition: float) -> No
         )
 
 
-def load_config(path: Path) -> TrainingConfig:
-    """Read a complete YAML file; SettingsError names file, key, expected and found."""
+def read_yaml(path: Path) -> object:
+    """Content of a configuration's file. ModelError when there is none, SettingsError when it is no YAML."""
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
@@ -236,16 +243,25 @@ def load_config(path: Path) -> TrainingConfig:
         ) from error
     except UnicodeDecodeError as error:
         raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    return parse_config(text, where=str(path))
+    return parse_yaml(text, where=str(path))
+
+
+def parse_yaml(text: str, *, where: str) -> object:
+    """Content of YAML text; `where` names it in errors. SettingsError."""
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
+
+
+def load_config(path: Path) -> TrainingConfig:
+    """Read a complete YAML file of stage 1; SettingsError names file, key, expected and found."""
+    return settings_from_dict(TrainingConfig, read_yaml(path), where=str(path))
 
 
 def parse_config(text: str, *, where: str) -> TrainingConfig:
-    """A complete configuration from YAML text, e.g. of a checkpoint; `where` names it in errors."""
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
-    return settings_from_dict(TrainingConfig, data, where=where)
+    """A complete configuration of stage 1 from YAML text, e.g. of a checkpoint."""
+    return settings_from_dict(TrainingConfig, parse_yaml(text, where=where), where=where)
 
 
 def as_yaml(config: object) -> str:

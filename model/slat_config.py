@@ -3,18 +3,17 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
-
 from model.config import (
     EncodersConfig,
     Recipe,
     TrainingConfig,
     ValidationConfig,
+    parse_yaml,
+    read_yaml,
+    require_adapter,
+    require_condition,
     require_held_out,
-    require_trainable_adapter,
-    require_unconditional,
 )
-from model.errors import ModelError
 from model.flow import LogitNormalTime, SamplerSettings, UniformTime
 from model.networks.lora import LoraSettings
 from model.stream_config import StreamConfig
@@ -23,7 +22,7 @@ from model.structured_latent.flow import SlatFlowConfig
 from model.structured_latent.latent import SlatVaeConfig
 from model.structured_latent.mesh_evaluation import MeshEvaluationConfig
 from model.structured_latent.surface_loss import SurfaceLossConfig
-from shards.settings import SettingsError, settings_from_dict
+from shards.settings import settings_from_dict
 
 __all__ = ["SlatFlowPart", "SlatTrainingConfig", "SlatVaePart", "load_any_config", "parse_any_config"]
 
@@ -58,15 +57,8 @@ class SlatFlowPart:
     recipe: Recipe
 
     def __post_init__(self) -> None:
-        if not 0 <= self.drop_condition < 1:
-            raise ValueError(f"drop_condition is {self.drop_condition}: expected a share below 1")
-        require_trainable_adapter(self.lora)
-        require_unconditional(self.guidance_strength, self.drop_condition)
-        if self.lora is not None and self.start is None:
-            raise ValueError(
-                "lora adapts weights that are there, and start is null: expected a file to start from; "
-                "name one (`forehoi weights import`), or set lora to null"
-            )
+        require_condition(self.drop_condition, self.guidance_strength)
+        require_adapter(self.lora, starts=self.start is not None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,23 +90,15 @@ class SlatTrainingConfig:
 
 def parse_any_config(text: str, *, where: str) -> TrainingConfig | SlatTrainingConfig:
     """A configuration of stage 1 or of stage 2 from YAML text: of stage 2 when it has its parts."""
-    try:
-        data = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
-    if isinstance(data, dict) and data.keys() & {"slat_vae", "slat_flow"}:
-        return settings_from_dict(SlatTrainingConfig, data, where=where)
-    return settings_from_dict(TrainingConfig, data, where=where)
+    return _of_its_stage(parse_yaml(text, where=where), where)
 
 
 def load_any_config(path: Path) -> TrainingConfig | SlatTrainingConfig:
     """Read a complete YAML file of either stage; SettingsError names file, key, expected and found."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise ModelError(
-            path, "does not exist", expected="a training configuration", action="See configs/model."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    return parse_any_config(text, where=str(path))
+    return _of_its_stage(read_yaml(path), str(path))
+
+
+def _of_its_stage(data: object, where: str) -> TrainingConfig | SlatTrainingConfig:
+    if isinstance(data, dict) and data.keys() & {"slat_vae", "slat_flow"}:
+        return settings_from_dict(SlatTrainingConfig, data, where=where)
+    return settings_from_dict(TrainingConfig, data, where=where)

@@ -4,6 +4,7 @@
 the package (model/encoders/data). It sees the same crop as the image encoder.
 """
 
+import hashlib
 import json
 import os
 from dataclasses import asdict, dataclass
@@ -12,12 +13,13 @@ from pathlib import Path
 import torch
 from jaxtyping import Float
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
 from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
+from model.weights.safetensors_file import write_tensors
 
 __all__ = [
     "N_JOINTS",
@@ -27,12 +29,14 @@ __all__ = [
     "HandOutput",
     "load_hand_net",
     "packaged_hand_net",
+    "packaged_hand_sha256",
     "save_hand_net",
 ]
 
 N_JOINTS = 21
 _STRIDES = (2, 4, 8, 16)
 _WEIGHTS, _CONFIG = "hand_encoder.safetensors", "hand_encoder.json"
+_PACKAGED = Path(__file__).parent / "data"
 _ACTION = (
     "Make it with `forehoi train hand_encoder` (configs/model/hands.yaml), or give the folder of a made one."
 )
@@ -171,13 +175,9 @@ class HandEncoder:
 def save_hand_net(network: HandNet, folder: Path, *, dtype: torch.dtype) -> None:
     """Weights (as `dtype`) and configuration into `folder`; each file appears whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    tensors = {
-        name: value.detach().cpu().to(dtype).contiguous() for name, value in network.state_dict().items()
-    }
-    weights, config = folder / f"{_WEIGHTS}.part", folder / f"{_CONFIG}.part"
-    save_file(tensors, weights)
+    write_tensors(folder / _WEIGHTS, {name: value.to(dtype) for name, value in network.state_dict().items()})
+    config = folder / f"{_CONFIG}.part"
     config.write_text(json.dumps(asdict(network.config), indent=1) + "\n", encoding="utf-8")
-    os.replace(weights, folder / _WEIGHTS)
     os.replace(config, folder / _CONFIG)
 
 
@@ -206,7 +206,12 @@ def load_hand_net(folder: Path) -> HandNet:
 
 def packaged_hand_net() -> HandNet:
     """The hand encoder that ships with the package; how it was made: model/encoders/data/README.md."""
-    return load_hand_net(Path(__file__).parent / "data")
+    return load_hand_net(_PACKAGED)
+
+
+def packaged_hand_sha256() -> str:
+    """Digest of its weights: another version of the package may bring others."""
+    return hashlib.sha256((_PACKAGED / _WEIGHTS).read_bytes()).hexdigest()
 
 
 def _unusable(folder: Path, problem: str) -> ModelError:

@@ -101,7 +101,7 @@ class HandTask:
         return Losses(total=total, parts=means)
 
     @torch.no_grad()
-    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:
+    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """Figures over all views, and pictures of the first.
 
         hand_mask_iou: hand and arm at stride 4, mean over views; held_object_iou: the same of the visible object.
@@ -111,7 +111,7 @@ class HandTask:
         sums = _Sums()
         pictures: dict[str, UInt8[np.ndarray, "height width 3"]] = {}
         for batch in batches:
-            output = module(batch.images.flatten(0, 1))
+            output = self.module(batch.images.flatten(0, 1))
             sums.add(output, batch)
             if not pictures:
                 pictures = {"hand": _montage(output, batch)}

@@ -1,6 +1,6 @@
 """Trained networks of both stages out of the folders of their trainings.
 
-Opening a run reads a few lines of JSON and tells what is missing; loading it takes seconds.
+Opening a run tells what is missing, and reads its weights once for their digests; loading it takes seconds.
 """
 
 import hashlib

@@ -4,7 +4,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-__all__ = ["CrossAttention", "MultiHeadRMSNorm", "SelfAttention"]
+from model.errors import ModelError
+
+__all__ = ["CrossAttention", "MultiHeadRMSNorm", "SelfAttention", "require_heads"]
+
+
+def require_heads(where: str, channels: int, heads: int) -> None:
+    """ModelError when the channels cannot be shared out evenly."""
+    if channels % heads:
+        raise ModelError(
+            where,
+            f"{heads} heads do not divide {channels} channels",
+            expected="channels % heads == 0",
+            action="Change one of them.",
+        )
 
 
 class MultiHeadRMSNorm(nn.Module):

@@ -1,12 +1,22 @@
 """The modulated diffusion-transformer block of TRELLIS (FORMATS 4.1), with grouped tokens and weighted sources."""
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from model.networks.attention import CrossAttention, SelfAttention
 
-__all__ = ["FeedForward", "ModulatedCrossBlock", "initialise_transformer", "layer_norm"]
+__all__ = [
+    "FeedForward",
+    "ModulatedCrossBlock",
+    "initialise_head",
+    "initialise_transformer",
+    "layer_norm",
+    "run_block",
+]
 
 
 def layer_norm(x: Float[Tensor, "*batch channel"], eps: float = 1e-6) -> Float[Tensor, "*batch channel"]:
@@ -63,26 +73,38 @@ class ModulatedCrossBlock(nn.Module):
         return x + gate_mlp * self.mlp(h)
 
 
-def initialise_transformer(branch: nn.Module, *, t_embedder: nn.Module, out_layer: nn.Linear) -> None:
-    """TRELLIS's initialisation, except that the output layer is small instead of zero.
+def run_block(block: nn.Module, *inputs: Any, recompute: bool) -> Any:
+    """The block's output; `recompute` keeps nothing of it for the backward pass: less memory, more time."""
+    if recompute and torch.is_grad_enabled():
+        # Nothing random inside a block (no dropout), so its RNG state need not be kept.
+        return checkpoint(block, *inputs, use_reentrant=False, preserve_rng_state=False)
+    return block(*inputs)
+
+
+def initialise_transformer(network: nn.Module, *, t_embedder: nn.Module | None) -> None:
+    """TRELLIS's initialisation of all but the head; for dense and sparse networks.
 
     Linear layers Xavier-uniform with zero bias, the time MLP N(0, 0.02²), adaLN zero (self-attention and MLP
-    start gated off; cross-attention is ungated and starts on). With a zero output layer no gradient would
-    leave the head in the first step; a tenth of Xavier's gain keeps the first prediction near zero and lets
-    the joint loss reach both branches through the cross-attentions from the first step.
+    start gated off; cross-attention is ungated and starts on). Convolutions stay as their blocks drew them.
     """
-    for module in branch.modules():
+    for module in network.modules():
         if isinstance(module, nn.Linear):
             nn.init.xavier_uniform_(module.weight)
             nn.init.zeros_(module.bias)
-    for module in t_embedder.modules():
+    for module in t_embedder.modules() if t_embedder is not None else ():
         if isinstance(module, nn.Linear):
             nn.init.normal_(module.weight, std=0.02)
-    for module in branch.modules():
-        if isinstance(module, ModulatedCrossBlock):
-            modulation = module.adaLN_modulation[1]
-            assert isinstance(modulation, nn.Linear)
-            nn.init.zeros_(modulation.weight)
+    for module in network.modules():
+        modulation = getattr(module, "adaLN_modulation", None)
+        if modulation is not None:
+            nn.init.zeros_(modulation[1].weight)
+
+
+def initialise_head(out_layer: nn.Linear) -> None:
+    """A tenth of Xavier's gain, where TRELLIS has zero.
+
+    With a zero head no gradient would leave it in the first step; this keeps the first prediction near zero and lets
+    the loss reach everything behind it from the first step.
+    """
     nn.init.xavier_uniform_(out_layer.weight, gain=0.1)
-    with torch.no_grad():
-        out_layer.bias.zero_()
+    nn.init.zeros_(out_layer.bias)

@@ -15,10 +15,9 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from model.errors import ModelError
-from model.networks.transformer import layer_norm
+from model.networks.transformer import layer_norm, run_block
 from model.sparse_structure.fusion import MaskContext, ViewFusion
 from model.sparse_structure.geometry_branch import GeometryBranch, GeometryBranchConfig
 from model.sparse_structure.mask_branch import MaskBranch, MaskBranchConfig
@@ -91,22 +90,16 @@ class DualBranchFlow(nn.Module):
         y, x = self.geometry.embed(x_t), self.masks.embed(masks_t, features)
         t_geometry, t_masks = self.geometry.t_embedder(t), self.masks.t_embedder(t)
         weights = self.fusion(x)
-        contexts = self.context(x)
+        contexts, recompute = self.context(x), self.config.checkpoint_blocks
         for block, i in zip(self.geometry.blocks, self._schedule, strict=True):
-            y_next = self._run(block, y, t_geometry, contexts, weights)
+            y_next = run_block(block, y, t_geometry, contexts, weights, recompute=recompute)
             if i is not None:
-                x = self._run(self.masks.blocks[i], x, t_masks, *_single_source(y))
+                x = run_block(self.masks.blocks[i], x, t_masks, *_single_source(y), recompute=recompute)
                 contexts = self.context(x)
             y = y_next
         return DualVelocity(
             geometry=self.geometry.read_out(y, x_t, t), masks=self.masks.read_out(x, masks_t, t)
         )
-
-    def _run(self, block: nn.Module, *inputs: Tensor) -> Tensor:
-        if self.config.checkpoint_blocks and torch.is_grad_enabled():
-            # Nothing random inside a block (no dropout), so its RNG state need not be kept.
-            return checkpoint(block, *inputs, use_reentrant=False, preserve_rng_state=False)
-        return block(*inputs)
 
     @staticmethod
     def unconditional_features(

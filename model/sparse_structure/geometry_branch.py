@@ -11,9 +11,15 @@ from torch import Tensor, nn
 
 from model.errors import ModelError
 from model.flow import preconditioned_velocity
+from model.networks.attention import require_heads
 from model.networks.embeddings import TimestepEmbedder, sincos_position_embedding
 from model.networks.patches import patchify, unpatchify
-from model.networks.transformer import ModulatedCrossBlock, initialise_transformer, layer_norm
+from model.networks.transformer import (
+    ModulatedCrossBlock,
+    initialise_head,
+    initialise_transformer,
+    layer_norm,
+)
 
 __all__ = ["GeometryBranch", "GeometryBranchConfig"]
 
@@ -37,13 +43,7 @@ class GeometryBranchConfig:
     preconditioned: bool
 
     def __post_init__(self) -> None:
-        if self.channels % self.heads:
-            raise ModelError(
-                "geometry branch",
-                f"{self.heads} heads do not divide {self.channels} channels",
-                expected="channels % heads == 0",
-                action="Change one of them.",
-            )
+        require_heads("geometry branch", self.channels, self.heads)
         if self.latent_resolution % self.patch:
             raise ModelError(
                 "geometry branch",
@@ -86,7 +86,8 @@ class GeometryBranch(nn.Module):
             for _ in range(config.blocks)
         )
         self.out_layer = nn.Linear(config.channels, patch_channels)
-        initialise_transformer(self, t_embedder=self.t_embedder, out_layer=self.out_layer)
+        initialise_transformer(self, t_embedder=self.t_embedder)
+        initialise_head(self.out_layer)
 
     def embed(self, x_t: Float[Tensor, "batch latent i j k"]) -> Float[Tensor, "batch 1 token channel"]:
         """Tokens y_1 of a noisy latent; ModelError for a latent of another shape."""

@@ -11,9 +11,15 @@ from torch import Tensor, nn
 
 from model.errors import ModelError
 from model.flow import binary_velocity
+from model.networks.attention import require_heads
 from model.networks.embeddings import TimestepEmbedder, sincos_position_embedding
 from model.networks.patches import patchify, unpatchify
-from model.networks.transformer import ModulatedCrossBlock, initialise_transformer, layer_norm
+from model.networks.transformer import (
+    ModulatedCrossBlock,
+    initialise_head,
+    initialise_transformer,
+    layer_norm,
+)
 
 __all__ = ["MaskBranch", "MaskBranchConfig"]
 
@@ -31,13 +37,7 @@ class MaskBranchConfig:
     mlp_ratio: int
 
     def __post_init__(self) -> None:
-        if self.channels % self.heads:
-            raise ModelError(
-                "mask branch",
-                f"{self.heads} heads do not divide {self.channels} channels",
-                expected="channels % heads == 0",
-                action="Change one of them.",
-            )
+        require_heads("mask branch", self.channels, self.heads)
 
     @property
     def mask_resolution(self) -> int:
@@ -69,7 +69,8 @@ class MaskBranch(nn.Module):
             for _ in range(config.blocks)
         )
         self.out_layer = nn.Linear(config.channels, config.patch**2)
-        initialise_transformer(self, t_embedder=self.t_embedder, out_layer=self.out_layer)
+        initialise_transformer(self, t_embedder=self.t_embedder)
+        initialise_head(self.out_layer)
 
     def embed(
         self, masks_t: Float[Tensor, "batch view 1 m m"], features: Float[Tensor, "batch view token feature"]

@@ -98,10 +98,9 @@ class StageOneTask:
         dropped = uniform(generators, device) < self.config.drop_condition
         noise_latent, noise_masks = normal_like(latent, generators), normal_like(masks, generators)
         features = self.features(batch.images)
-        features = torch.where(dropped[:, None, None, None], torch.zeros_like(features), features)
-        velocity = self.network.flow(
-            interpolate(latent, noise_latent, t), interpolate(masks, noise_masks, t), t, features
-        )
+        flow = self.network.flow
+        features = torch.where(dropped[:, None, None, None], flow.unconditional_features(features), features)
+        velocity = flow(interpolate(latent, noise_latent, t), interpolate(masks, noise_masks, t), t, features)
         losses = joint_cfm_loss(
             predicted_masks=velocity.masks,
             target_masks=velocity_target(masks, noise_masks),
@@ -146,7 +145,7 @@ class StageOneTask:
         return Prediction(occupancy=occupancy_from_logits(logits), masks=clean["masks"][:, :, 0])
 
     @torch.no_grad()
-    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
+    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """Means of FIGURES over samples or views, with fixed noise; a figure without views is NaN."""
         figures: dict[str, list[float]] = {name: [] for name in FIGURES}
         pictures: dict[str, np.ndarray] = {}

@@ -55,7 +55,7 @@ class VaeTask:
         return Losses(total=losses.total, parts={"dice": losses.dice.mean(), "kl": losses.kl.mean()})
 
     @torch.no_grad()
-    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
+    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """voxel_iou of shapes through encoder and decoder; pictures: truth beside reconstruction."""
         scores: list[Tensor] = []
         pictures: dict[str, np.ndarray] = {}

@@ -11,11 +11,10 @@ from torch import Tensor, nn
 
 from model.networks.sparse.blocks import SparseSubdivideBlock3d
 from model.networks.sparse.tensor import SparseTensor
-from model.networks.sparse.transformer import initialise_sparse_transformer
-from model.networks.transformer import layer_norm
+from model.networks.transformer import initialise_head, initialise_transformer, layer_norm
 from model.structured_latent.gaussians import GAUSSIAN_CHANNELS, offset_perturbation
 from model.structured_latent.latent import SlatVaeConfig, require_layout
-from model.structured_latent.trunk import run_trunk, scale_down, trunk_blocks
+from model.structured_latent.trunk import run_trunk, trunk_blocks
 from model.surface.fields import CHANNELS
 
 __all__ = ["GaussianDecoder", "SurfaceDecoder"]
@@ -37,8 +36,8 @@ class SurfaceDecoder(nn.Module):
             for wide, narrow in pairwise(widths)
         )
         self.out_layer = nn.Linear(widths[-1], CHANNELS)
-        initialise_sparse_transformer(self, t_embedder=None)
-        scale_down(self.out_layer)
+        initialise_transformer(self, t_embedder=None)
+        initialise_head(self.out_layer)
 
     def forward(self, latent: SparseTensor) -> SparseTensor:
         """Each voxel becomes 8 ** len(upsample); ModelError for other channels or another resolution."""
@@ -64,8 +63,8 @@ class GaussianDecoder(nn.Module):
         self.blocks = trunk_blocks(config)
         self.out_layer = nn.Linear(config.channels, GAUSSIAN_CHANNELS)
         self.register_buffer("offset_perturbation", offset_perturbation())
-        initialise_sparse_transformer(self, t_embedder=None)
-        scale_down(self.out_layer)
+        initialise_transformer(self, t_embedder=None)
+        initialise_head(self.out_layer)
 
     def forward(self, latent: SparseTensor) -> SparseTensor:
         """448 channels per voxel; ModelError for other channels or another resolution."""

@@ -6,10 +6,9 @@ With the `paper` values of `SlatVaeConfig` it has the parameters of slat_enc_swi
 from torch import nn
 
 from model.networks.sparse.tensor import SparseTensor
-from model.networks.sparse.transformer import initialise_sparse_transformer
-from model.networks.transformer import layer_norm
+from model.networks.transformer import initialise_head, initialise_transformer, layer_norm
 from model.structured_latent.latent import SlatDistribution, SlatVaeConfig, require_layout
-from model.structured_latent.trunk import run_trunk, scale_down, trunk_blocks
+from model.structured_latent.trunk import run_trunk, trunk_blocks
 
 __all__ = ["SlatEncoder"]
 
@@ -23,8 +22,8 @@ class SlatEncoder(nn.Module):
         self.input_layer = nn.Linear(config.feature_channels, config.channels)
         self.blocks = trunk_blocks(config)
         self.out_layer = nn.Linear(config.channels, 2 * config.latent_channels)
-        initialise_sparse_transformer(self, t_embedder=None)
-        scale_down(self.out_layer)
+        initialise_transformer(self, t_embedder=None)
+        initialise_head(self.out_layer)
 
     def forward(self, features: SparseTensor) -> SlatDistribution:
         """Mean and logvar on the grid of the features; ModelError for other channels or another resolution."""

@@ -13,18 +13,18 @@ from itertools import pairwise
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from model.errors import ModelError
 from model.flow import preconditioned_velocity
+from model.networks.attention import require_heads
 from model.networks.embeddings import TimestepEmbedder
 from model.networks.sparse.blocks import SparseResBlock3d
 from model.networks.sparse.resampling import mean_pool, unpool
 from model.networks.sparse.tensor import SparseTensor
-from model.networks.sparse.transformer import ModulatedSparseCrossBlock, initialise_sparse_transformer
-from model.networks.transformer import layer_norm
+from model.networks.sparse.transformer import ModulatedSparseCrossBlock
+from model.networks.transformer import initialise_head, initialise_transformer, layer_norm, run_block
 from model.structured_latent.latent import require_layout
-from model.structured_latent.trunk import embedded, scale_down
+from model.structured_latent.trunk import embedded
 
 __all__ = ["SlatFlow", "SlatFlowConfig"]
 
@@ -52,13 +52,7 @@ class SlatFlowConfig:
     preconditioned: bool
 
     def __post_init__(self) -> None:
-        if self.channels % self.heads:
-            raise ModelError(
-                "slat flow",
-                f"{self.heads} heads do not divide {self.channels} channels",
-                expected="channels % heads == 0",
-                action="Change one of them.",
-            )
+        require_heads("slat flow", self.channels, self.heads)
         if self.patch != 2 ** len(self.io_channels) or self.resolution % self.patch:
             raise ModelError(
                 "slat flow",
@@ -97,8 +91,8 @@ class SlatFlow(nn.Module):
             for _ in range(config.blocks)
         )
         self.out_layer = nn.Linear(widths[0], config.latent_channels)
-        initialise_sparse_transformer(self, t_embedder=self.t_embedder)
-        scale_down(self.out_layer)
+        initialise_transformer(self, t_embedder=self.t_embedder)
+        initialise_head(self.out_layer)
 
     def forward(
         self,
@@ -121,7 +115,7 @@ class SlatFlow(nn.Module):
             skips.append(self.input_blocks[2 * level + 1](pooled, t_embedding))
         h = embedded(skips[-1] if skips else h, self.input_layer)
         for block in self.blocks:
-            h = self._run(block, h, t_embedding, contexts, weights)
+            h = run_block(block, h, t_embedding, contexts, weights, recompute=self.config.checkpoint_blocks)
         for i, block in enumerate(self.out_blocks):
             h = _beside(h, skips.pop())
             # The first block of a level reads the coarse grid and works on the fine one.
@@ -132,12 +126,6 @@ class SlatFlow(nn.Module):
                 x_t.features, output.to(x_t.features.dtype), t[h.grid.batch_index]
             )
         return h.with_features(output)
-
-    def _run(self, block: nn.Module, h: SparseTensor, *condition: Tensor) -> SparseTensor:
-        if self.config.checkpoint_blocks and torch.is_grad_enabled():
-            # Nothing random inside a block (no dropout), so its RNG state need not be kept.
-            return checkpoint(block, h, *condition, use_reentrant=False, preserve_rng_state=False)
-        return block(h, *condition)
 
     def _check(self, x_t: SparseTensor, contexts: Tensor) -> None:
         config = self.config

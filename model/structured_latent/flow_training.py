@@ -15,6 +15,7 @@ from model.flow import (
     TimeDistribution,
     euler_sample,
     guided,
+    interpolate,
     times_from_uniform,
     velocity_target,
 )
@@ -73,8 +74,7 @@ class SlatFlowTask:
         t = times_from_uniform(self.config.time, uniform(generators, device))
         dropped = uniform(generators, device) < self.config.drop_condition
         noise = normal_rows(grid, clean.features.shape[1], generators)
-        t_row = t[grid.batch_index, None]
-        x_t = clean.with_features((1 - t_row) * clean.features + t_row * noise)
+        x_t = clean.with_features(interpolate(clean.features, noise, t[grid.batch_index]))
         velocity = self.network(x_t, t, self.condition(batch.images).dropped(dropped))
         wrong = (velocity.features.float() - velocity_target(clean.features, noise)).square().mean(1)
         total = wrong.new_zeros(grid.batch_size).index_add(0, grid.batch_index, wrong)
@@ -114,7 +114,7 @@ class SlatFlowTask:
         return SlatPrediction(latent=latent, decoded=self.vae.surface(latent))
 
     @torch.no_grad()
-    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
+    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """Scores of meshes from sampled latents on the true voxels, fixed noise; every sample of the batches.
 
         Beside them, every object once: what they have to beat, the mean latent at every voxel (mean_latent_*), and
@@ -132,14 +132,17 @@ class SlatFlowTask:
             clean = self.clean_latent(batch)
             wrong = self.network.normalisation.normalised(prediction.latent).features - clean.features
             errors += [float(part.square().mean()) for part in wrong.split(clean.grid.sample_sizes)]
-            mean = self.decoded(clean.with_features(torch.zeros_like(clean.features)))
-            true = self.decoded(clean)
-            for index, uid in enumerate(batch.true_surface.object_uids):
-                truth = object_surface(batch.true_surface, index)
+            uids = batch.true_surface.object_uids
+            truths = [object_surface(batch.true_surface, index) for index in range(len(uids))]
+            if not ceiling.keys() >= set(uids):
+                mean = self.decoded(clean.with_features(torch.zeros_like(clean.features)))
+                true = self.decoded(clean)
+                for index, (uid, truth) in enumerate(zip(uids, truths)):
+                    if uid not in ceiling:
+                        baseline[uid] = scored_mesh(mean.decoded, index, truth, self.evaluation)
+                        ceiling[uid] = scored_mesh(true.decoded, index, truth, self.evaluation)
+            for index, (uid, truth) in enumerate(zip(uids, truths)):
                 found.append(scored_mesh(prediction.decoded, index, truth, self.evaluation))
-                if uid not in ceiling:
-                    baseline[uid] = scored_mesh(mean.decoded, index, truth, self.evaluation)
-                    ceiling[uid] = scored_mesh(true.decoded, index, truth, self.evaluation)
                 rows.append((truth, (found[-1].mesh, baseline[uid].mesh, ceiling[uid].mesh)))
         figures = mean_scores(found) | {"latent_error": float(np.mean(errors)) if errors else float("nan")}
         figures |= _named("mean_latent", mean_scores(list(baseline.values())))

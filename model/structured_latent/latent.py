@@ -8,6 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from model.errors import ModelError
+from model.networks.attention import require_heads
 from model.networks.sparse.tensor import SparseTensor
 
 __all__ = ["LatentNormalisation", "SlatDistribution", "SlatVaeConfig", "require_layout", "sample"]
@@ -43,13 +44,7 @@ class SlatVaeConfig:
         sizes = (self.feature_channels, self.channels, self.latent_channels, self.heads, self.mlp_ratio)
         if min(*sizes, self.window, self.resolution, *self.upsample) < 1 or self.blocks < 0:
             raise ModelError("slat vae", f"sizes {self}", expected="positive sizes", action="Correct them.")
-        if self.channels % self.heads:
-            raise ModelError(
-                "slat vae",
-                f"{self.heads} heads do not divide {self.channels} channels",
-                expected="channels % heads == 0",
-                action="Change one of them.",
-            )
+        require_heads("slat vae", self.channels, self.heads)
 
     @property
     def surface_resolution(self) -> int:

@@ -12,7 +12,7 @@ from model.networks.sparse.tensor import SparseTensor
 from model.networks.sparse.transformer import SparseTransformerBlock, shifted_windows
 from model.structured_latent.latent import SlatVaeConfig
 
-__all__ = ["embedded", "run_trunk", "scale_down", "trunk_blocks"]
+__all__ = ["embedded", "run_trunk", "trunk_blocks"]
 
 
 def trunk_blocks(config: SlatVaeConfig) -> nn.ModuleList:
@@ -37,12 +37,3 @@ def embedded(h: SparseTensor, of: nn.Linear) -> SparseTensor:
     """h + the embedding of its voxels' positions, in the type of the parameters: float32 under autocast."""
     position = voxel_position_embedding(h.grid, h.features.shape[1]).to(of.weight.dtype)
     return h.with_features(h.features + position)
-
-
-def scale_down(out_layer: nn.Linear) -> None:
-    """Initialise a head with a tenth of Xavier's gain.
-
-    TRELLIS starts its heads at zero, and then nothing behind them gets a gradient in the first step.
-    """
-    nn.init.xavier_uniform_(out_layer.weight, gain=0.1)
-    nn.init.zeros_(out_layer.bias)

@@ -68,7 +68,7 @@ class SlatVaeTask:
         )
 
     @torch.no_grad()
-    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:  # noqa: ARG002
+    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """Scores of the meshes of mean latents, every object once; pictures: truth beside reconstruction."""
         meshes: dict[str, ScoredMesh] = {}
         rows = []

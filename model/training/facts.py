@@ -1,6 +1,5 @@
 """What stage 1 must know of its training data when it is used: kept with the run, so that nobody needs the data."""
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,10 +7,11 @@ from pathlib import Path
 import torch
 from jaxtyping import Bool
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from model.errors import ModelError
+from model.weights.safetensors_file import write_tensors
 
 __all__ = ["TrainingFacts", "facts_of_run", "load_facts"]
 
@@ -31,11 +31,9 @@ def facts_of_run(folder: Path, measure: Callable[[], TrainingFacts]) -> Training
     if (folder / _FILE).exists():
         return load_facts(folder)
     facts = measure()
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f"{_FILE}.{os.getpid()}.part"  # every rank measures the same
     scale = torch.tensor(facts.latent_scale, dtype=torch.float64)
-    save_file({"latent_scale": scale, "mean_shape": facts.mean_shape.cpu().contiguous()}, part)
-    os.replace(part, folder / _FILE)
+    # Every rank measures, and writes, the same.
+    write_tensors(folder / _FILE, {"latent_scale": scale, "mean_shape": facts.mean_shape})
     return facts
 
 

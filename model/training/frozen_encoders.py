@@ -1,6 +1,7 @@
-"""The frozen encoders of pictures and hands that a configuration names."""
+"""The frozen encoders of pictures and hands that a configuration names, and the trained aggregator over them."""
 
 from model.config import EncodersConfig, OwnHandEncoder, PackagedHandEncoder
+from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.cached import CachedEncoder
 from model.encoders.dino import DinoConfig, load_dino
 from model.encoders.efficientnet import load_efficientnet
@@ -9,7 +10,7 @@ from model.encoders.protocol import FeatureEncoder
 from model.encoders.wilor import load_wilor
 from model.errors import ModelError
 
-__all__ = ["given_hand_encoder", "image_encoder", "with_cache"]
+__all__ = ["aggregator_over", "given_hand_encoder", "image_encoder", "with_cache"]
 
 
 def image_encoder(config: EncodersConfig) -> FeatureEncoder:
@@ -34,6 +35,23 @@ def given_hand_encoder(config: EncodersConfig) -> FeatureEncoder:
     if isinstance(chosen, PackagedHandEncoder):
         return with_cache(HandEncoder(network=packaged_hand_net(), grid=chosen.packaged_grid), config)
     return with_cache(load_wilor(chosen), config)
+
+
+def aggregator_over(
+    image: FeatureEncoder, hand: FeatureEncoder, *, hand_width: int, hidden: int, channels: int
+) -> FeatureAggregator:
+    """An untrained aggregator of the sizes that two encoders ask for."""
+    return FeatureAggregator(
+        AggregatorConfig(
+            image_channels=image.channels,
+            image_grid=image.grid,
+            hand_channels=hand.channels,
+            hand_grid=hand.grid,
+            hand_width=hand_width,
+            hidden=hidden,
+            channels=channels,
+        )
+    )
 
 
 def with_cache(encoder: FeatureEncoder, config: EncodersConfig) -> FeatureEncoder:

@@ -2,10 +2,8 @@
 
 import hashlib
 from dataclasses import replace
-from pathlib import Path
 from typing import TypeVar
 
-import model.encoders.hand
 from model.config import (
     EncodersConfig,
     HandPart,
@@ -17,6 +15,7 @@ from model.config import (
     VaePart,
     as_yaml,
 )
+from model.encoders.hand import packaged_hand_sha256
 from model.stream_config import StreamConfig
 from model.weights.weight_file import weights_sha256
 
@@ -76,8 +75,7 @@ def encoder_digests(encoders: EncodersConfig) -> tuple[str, ...]:
     """Digest of the packaged hand encoder, if it is used: it may change with the package."""
     if not isinstance(encoders.hand, PackagedHandEncoder):
         return ()
-    weights = Path(model.encoders.hand.__file__).parent / "data" / "hand_encoder.safetensors"
-    return (hashlib.sha256(weights.read_bytes()).hexdigest(),)
+    return (packaged_hand_sha256(),)
 
 
 def _deciding(part: _Part) -> _Part:

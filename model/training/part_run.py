@@ -23,7 +23,7 @@ from model.training.source import StreamSource
 from model.training.task import Evaluation, Task
 from model.training.trainer import StepReport, train
 
-__all__ = ["PartData", "load_part", "part_data", "run_part"]
+__all__ = ["PartData", "load_part", "one_pass", "part_data", "run_part"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,6 +68,12 @@ def part_data(
     )
 
 
+def one_pass(data: StreamConfig, batch_size: int) -> StreamConfig:
+    """The training motions once each, as they are: for what is measured on their objects."""
+    once = validation_config(data, split=data.split, cameras=data.cameras, views=1, batch_size=batch_size)
+    return replace(once, image_size=32, workers=0)
+
+
 def run_part(
     task: Task,
     data: PartData,
@@ -83,7 +89,7 @@ def run_part(
     last: list[Evaluation] = []
 
     def validate() -> Evaluation:
-        last[:] = [task.evaluate(task.module, data.validation(accelerator.device))]
+        last[:] = [task.evaluate(data.validation(accelerator.device))]
         return last[0]
 
     train(

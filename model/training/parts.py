@@ -6,7 +6,6 @@ RUN/hand_encoder/hand_encoder.{safetensors,json}    its averaged weights in floa
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -25,7 +24,6 @@ from model.config import (
     as_yaml,
 )
 from model.data import ShardStream
-from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.hand import HandEncoder, HandNet, save_hand_net
 from model.encoders.hand_training import HandTask
 from model.encoders.protocol import FeatureEncoder
@@ -39,9 +37,9 @@ from model.sparse_structure.vae import StructureVae
 from model.sparse_structure.vae_training import VaeTask
 from model.training.checkpoint import latest_checkpoint
 from model.training.facts import TrainingFacts, facts_of_run, load_facts
-from model.training.frozen_encoders import given_hand_encoder, image_encoder, with_cache
+from model.training.frozen_encoders import aggregator_over, given_hand_encoder, image_encoder, with_cache
 from model.training.identity import part_sha256
-from model.training.part_run import load_part, part_data, run_part
+from model.training.part_run import load_part, one_pass, part_data, run_part
 from model.training.task import Task
 from model.training.trainer import StepReport
 from model.weights.weight_file import VAE, load_start, load_weights
@@ -139,16 +137,12 @@ def _stage_one_task(
     image, hand = image_encoder(config.encoders), _hand_encoder(config, folder)
     image.to(device, torch.float32)
     hand.to(device, torch.float32)
-    aggregator = FeatureAggregator(
-        AggregatorConfig(
-            image_channels=image.channels,
-            image_grid=image.grid,
-            hand_channels=hand.channels,
-            hand_grid=hand.grid,
-            hand_width=part.hand_width,
-            hidden=part.hidden,
-            channels=part.network.masks.feature_channels,
-        )
+    aggregator = aggregator_over(
+        image,
+        hand,
+        hand_width=part.hand_width,
+        hidden=part.hidden,
+        channels=part.network.masks.feature_channels,
     )
     network = StageOne(aggregator, DualBranchFlow(part.network))
     _start(network, part)
@@ -197,10 +191,7 @@ def _measured(config: TrainingConfig, vae: StructureVae, device: torch.device) -
 
 def _training_shapes(config: TrainingConfig) -> Bool[Tensor, "shape 64 64 64"]:
     """Occupancies of the first 128 motions of the training data."""
-    stream = replace(
-        config.data, batch_size=8, views=(1, 1), image_size=32, endless=False, workers=0, samples_per_motion=1
-    )
-    return torch.cat([batch.occupancy for batch in islice(ShardStream(stream), 16)])
+    return torch.cat([batch.occupancy for batch in islice(ShardStream(one_pass(config.data, 8)), 16)])
 
 
 @torch.no_grad()

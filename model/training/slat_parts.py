@@ -12,7 +12,6 @@ from accelerate import Accelerator
 
 from model.config import as_yaml
 from model.data import ShardStream
-from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.flow import Guidance
 from model.networks.lora import add_lora
 from model.networks.sparse.tensor import SparseTensor
@@ -24,9 +23,9 @@ from model.structured_latent.latent import LatentNormalisation
 from model.structured_latent.object_input import ObjectInputs
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
-from model.training.frozen_encoders import given_hand_encoder, image_encoder
+from model.training.frozen_encoders import aggregator_over, given_hand_encoder, image_encoder
 from model.training.identity import deciding_data, deciding_recipe, encoder_digests, sha256_of
-from model.training.part_run import load_part, part_data, run_part
+from model.training.part_run import load_part, one_pass, part_data, run_part
 from model.training.task import Task
 from model.training.trainer import StepReport
 from model.weights.slat import load_stage_two_start
@@ -96,35 +95,31 @@ def _vae_task(config: SlatTrainingConfig) -> SlatVaeTask:
 def _flow_task(config: SlatTrainingConfig, folder: Path, device: torch.device) -> SlatFlowTask:
     vae = _trained_vae(config, folder, device)
     normalisation = LatentNormalisation.measured(_training_latents(config, vae, device))
-    task = _assembled(config, vae, normalisation, device)
-    part = config.slat_flow
-    if part.start is not None:
-        load_stage_two_start(part.start, task.network)
-    if part.lora is not None:
-        add_lora(task.network.flow, part.lora)
-    return task
+    return _assembled(config, vae, normalisation, device)
 
 
 def _assembled(
     config: SlatTrainingConfig, vae: SlatVae, normalisation: LatentNormalisation, device: torch.device
 ) -> SlatFlowTask:
+    """Untrained, or with the weights that it starts from, and adapters on them."""
     part = config.slat_flow
     image, hand = image_encoder(config.encoders), given_hand_encoder(config.encoders)
     image.to(device, torch.float32)
     hand.to(device, torch.float32)
-    aggregator = FeatureAggregator(
-        AggregatorConfig(
-            image_channels=image.channels,
-            image_grid=image.grid,
-            hand_channels=hand.channels,
-            hand_grid=hand.grid,
-            hand_width=part.hand_width,
-            hidden=part.hidden,
-            channels=part.network.condition_channels,
-        )
+    aggregator = aggregator_over(
+        image,
+        hand,
+        hand_width=part.hand_width,
+        hidden=part.hidden,
+        channels=part.network.condition_channels,
     )
+    network = ViewConditionedSlatFlow(aggregator, SlatFlow(part.network), normalisation)
+    if part.start is not None:
+        load_stage_two_start(part.start, network)
+    if part.lora is not None:
+        add_lora(network.flow, part.lora)
     return SlatFlowTask(
-        network=ViewConditionedSlatFlow(aggregator, SlatFlow(part.network), normalisation),
+        network=network,
         image_encoder=image,
         hand_encoder=hand,
         vae=vae,
@@ -150,16 +145,7 @@ def _training_latents(
     config: SlatTrainingConfig, vae: SlatVae, device: torch.device
 ) -> Iterator[SparseTensor]:
     """Mean latents of the training objects, each once."""
-    stream = replace(
-        config.data,
-        surface=True,
-        batch_size=1,
-        views=(1, 1),
-        image_size=32,
-        endless=False,
-        workers=0,
-        samples_per_motion=1,
-    )
+    stream = replace(one_pass(config.data, 1), surface=True)
     inputs, seen = ObjectInputs(), set[str]()
     for batch in ShardStream(stream):
         on_device: Batch = batch.to(device, torch.float32)

@@ -41,5 +41,5 @@ class Task(Protocol):
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
         """Loss of a batch. All randomness comes from the generators, one per sample (`draws.py`)."""
 
-    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:
+    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """Figures with the given (averaged) weights; no gradients, randomness of its own fixed seed."""

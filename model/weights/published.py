@@ -7,6 +7,7 @@ do not say (attention heads, windows) is compared with the JSON that TRELLIS put
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from importlib.resources import files
 from pathlib import Path
 
 from torch import Tensor, nn
@@ -22,6 +23,8 @@ __all__ = [
     "PublishedNetwork",
     "find_published",
     "import_networks",
+    "prefixed",
+    "published_shapes",
 ]
 
 Shapes = Mapping[str, tuple[int, ...]]
@@ -66,6 +69,18 @@ class ImportReport:
     absent: tuple[str, ...]  # networks that the source does not have
     ignored: tuple[Path, ...]
     key_list: Path  # JSON: every key
+
+
+def published_shapes(name: str) -> dict[str, tuple[int, ...]]:
+    """Names and shapes of a network of TRELLIS-image-large, e.g. "ss_enc_conv3d_16l8" or "slat_enc_swin8_B_64l8"."""
+    stage = name.partition("_")[0]
+    manifest = json.loads((files("model.weights") / "data" / f"trellis_{stage}.json").read_text("utf-8"))
+    return {key: tuple(shape) for key, shape in manifest[name].items()}
+
+
+def prefixed(group: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Published tensors under a group of our files."""
+    return {group + name: tensor for name, tensor in tensors.items()}
 
 
 def find_published(source: Path, networks: Sequence[PublishedNetwork]) -> PublishedFiles:

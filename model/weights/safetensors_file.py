@@ -1,16 +1,26 @@
-"""Reading safetensors files of unknown origin: header first, tensors when they are known to fit."""
+"""Safetensors files: written whole or not at all; read header first, tensors when they are known to fit."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from model.errors import ModelError
 
-__all__ = ["Header", "KeyComparison", "compare_keys", "read_header", "read_tensors", "shapes_of"]
+__all__ = [
+    "Header",
+    "KeyComparison",
+    "compare_keys",
+    "read_header",
+    "read_tensors",
+    "shapes_of",
+    "write_tensors",
+]
 
 _FLOATS = ("F32", "F16", "BF16")
 
@@ -68,6 +78,15 @@ def compare_keys(found: Shapes, wanted: Shapes) -> KeyComparison:
             if name in common and wanted[name] != found[name]
         ),
     )
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str, str] | None = None) -> None:
+    """The file appears whole or not at all; several processes may write the same."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    saved = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    save_file(saved, partial, metadata=metadata)
+    os.replace(partial, path)
 
 
 def read_header(path: Path, *, expected: str, action: str) -> Header:

@@ -12,7 +12,6 @@ slat_dec_rf_swin8_B_64l8r16, the radiance-field decoder, has no use here.
 """
 
 import json
-from importlib.resources import files
 from pathlib import Path
 
 import torch
@@ -27,7 +26,7 @@ from model.structured_latent.flow import SlatFlow, SlatFlowConfig
 from model.structured_latent.gaussians import offset_perturbation
 from model.structured_latent.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
-from model.weights.published import PublishedNetwork
+from model.weights.published import PublishedNetwork, prefixed, published_shapes
 from model.weights.safetensors_file import read_header
 from model.weights.weight_file import load_weights
 
@@ -37,7 +36,6 @@ __all__ = [
     "SLAT_FLOW",
     "SURFACE",
     "load_stage_two_start",
-    "published_slat_shapes",
     "slat_networks",
     "trellis_normalisation",
 ]
@@ -81,12 +79,6 @@ def trellis_normalisation() -> LatentNormalisation:
     return LatentNormalisation(torch.tensor(_MEAN), torch.tensor(_STD))
 
 
-def published_slat_shapes(name: str) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a published network, e.g. "slat_enc_swin8_B_64l8"."""
-    manifest = json.loads((files("model.weights") / "data" / "trellis_slat.json").read_text("utf-8"))
-    return {key: tuple(shape) for key, shape in manifest[name].items()}
-
-
 def slat_networks(flow: SlatFlowConfig, vae: SlatVaeConfig) -> tuple[PublishedNetwork, ...]:
     """The published networks of stage 2 for `import_networks`. ModelError: the flow pools otherwise than TRELLIS."""
     if flow.pool_pseudo_count != 1:
@@ -123,7 +115,7 @@ def slat_networks(flow: SlatFlowConfig, vae: SlatVaeConfig) -> tuple[PublishedNe
     return tuple(
         PublishedNetwork(
             name=name,
-            shapes=published_slat_shapes(name),
+            shapes=published_shapes(name),
             class_names=class_names,
             arguments=of_flow if part == "flow" else of_vae | {"attn_mode": "swin"},
             module=modules[part],
@@ -150,11 +142,11 @@ def load_stage_two_start(path: Path, network: ViewConditionedSlatFlow) -> None:
 
 def _flow_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
     normalisation = _published_normalisation(path).state_dict()
-    return _prefixed(SLAT_FLOW, tensors) | _prefixed(f"{STAGE_TWO}normalisation.", normalisation)
+    return prefixed(SLAT_FLOW, tensors) | prefixed(f"{STAGE_TWO}normalisation.", normalisation)
 
 
 def _encoder_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG001
-    return _prefixed(SLAT_ENCODER, tensors)
+    return prefixed(SLAT_ENCODER, tensors)
 
 
 def _surface_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG001
@@ -162,7 +154,7 @@ def _surface_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor
         name: pointwise_from_spconv(tensor) if name.endswith("skip_connection.conv.weight") else tensor
         for name, tensor in tensors.items()
     }
-    return _prefixed(SURFACE, converted)
+    return prefixed(SURFACE, converted)
 
 
 def _gaussian_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -175,11 +167,7 @@ def _gaussian_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tenso
             expected="TRELLIS's layout of 32 gaussians per voxel",
             action="Use an unmodified checkpoint.",
         )
-    return _prefixed(GAUSSIANS, tensors)
-
-
-def _prefixed(prefix: str, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    return {prefix + name: tensor for name, tensor in tensors.items()}
+    return prefixed(GAUSSIANS, tensors)
 
 
 def _published_normalisation(path: Path) -> LatentNormalisation:

@@ -3,8 +3,6 @@
 Time and sign need no conversion: TRELLIS has t = 0 at data and velocity = noise - clean.
 """
 
-import json
-from importlib.resources import files
 from pathlib import Path
 
 import torch
@@ -14,17 +12,11 @@ from model.errors import ModelError
 from model.networks.embeddings import sincos_position_embedding
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.vae import StructureDecoder, StructureEncoder, VaeConfig
-from model.weights.published import PublishedNetwork
+from model.weights.published import PublishedNetwork, prefixed, published_shapes
 from model.weights.safetensors_file import shapes_of
 from model.weights.weight_file import GEOMETRY, VAE
 
-__all__ = ["published_shapes", "stage_one_networks"]
-
-
-def published_shapes(name: str) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of a published network, e.g. "ss_enc_conv3d_16l8"."""
-    manifest = json.loads((files("model.weights") / "data" / "trellis_ss.json").read_text("utf-8"))
-    return {key: tuple(shape) for key, shape in manifest[name].items()}
+__all__ = ["stage_one_networks"]
 
 
 def stage_one_networks(flow: DualBranchConfig, vae: VaeConfig) -> tuple[PublishedNetwork, ...]:
@@ -36,13 +28,13 @@ def stage_one_networks(flow: DualBranchConfig, vae: VaeConfig) -> tuple[Publishe
 
     def flow_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
         _check_position_embedding(path, tensors["pos_emb"], flow)
-        return {GEOMETRY + name: tensor for name, tensor in tensors.items()}
+        return prefixed(GEOMETRY, tensors)
 
     def encoder_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG001
-        return {f"{VAE}encoder.{name}": tensor for name, tensor in tensors.items()}
+        return prefixed(f"{VAE}encoder.", tensors)
 
     def decoder_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:  # noqa: ARG001
-        return {f"{VAE}decoder.{name}": tensor for name, tensor in tensors.items()}
+        return prefixed(f"{VAE}decoder.", tensors)
 
     return (
         PublishedNetwork(

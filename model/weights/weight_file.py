@@ -12,18 +12,23 @@ that they stand on.
 
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from model.errors import ModelError
 from model.sparse_structure.stage_one import StageOne
-from model.weights.safetensors_file import Header, compare_keys, read_header, read_tensors, shapes_of
+from model.weights.safetensors_file import (
+    Header,
+    compare_keys,
+    read_header,
+    read_tensors,
+    shapes_of,
+    write_tensors,
+)
 
 __all__ = [
     "GEOMETRY",
@@ -60,12 +65,9 @@ class StartConfig:
 
 def write_weight_file(path: Path, tensors: Mapping[str, Tensor], *, sources: Mapping[str, str]) -> None:
     """Write `tensors` under our names; the file appears whole or not at all. `sources` says what came from where."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     saved = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     metadata = {"format": _FORMAT, "sha256": _digest(saved), "sources": json.dumps(dict(sources))}
-    partial = path.with_name(f".{path.name}.partial")
-    save_file(saved, partial, metadata=metadata)
-    os.replace(partial, path)
+    write_tensors(path, saved, metadata)
 
 
 def weights_sha256(path: Path) -> str:

@@ -19,15 +19,16 @@ from accelerate import Accelerator
 
 from model.config import OwnHandEncoder, TrainingConfig, load_config
 from model.data import open_motions
-from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.efficientnet import EfficientNetConfig, load_efficientnet
 from model.encoders.hand import HandEncoder, HandNet
+from model.encoders.protocol import FeatureEncoder
 from model.flow import Guidance
 from model.sample import Batch
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.training.draws import sample_generators
+from model.training.frozen_encoders import aggregator_over, given_hand_encoder
 from model.training.source import StreamSource
 from model.training.trainer import StepReport, train
 
@@ -44,22 +45,23 @@ def stage_one_task(config: TrainingConfig) -> StageOneTask:
     """The task of a configuration with open encoders, with random weights in all but the image encoder."""
     part, hand = config.stage_one, config.encoders.hand
     assert isinstance(config.encoders.image, EfficientNetConfig)
-    assert isinstance(hand, OwnHandEncoder)
-    assert config.hand_encoder is not None
     torch.manual_seed(0)
     image_encoder = load_efficientnet(config.encoders.image)
-    hand_encoder = HandEncoder(network=HandNet(config.hand_encoder.network).eval(), grid=hand.own_grid)
-    sizes = AggregatorConfig(
-        image_channels=image_encoder.channels,
-        image_grid=image_encoder.grid,
-        hand_channels=hand_encoder.channels,
-        hand_grid=hand_encoder.grid,
+    if isinstance(hand, OwnHandEncoder):
+        assert config.hand_encoder is not None
+        network = HandNet(config.hand_encoder.network).eval()
+        hand_encoder: FeatureEncoder = HandEncoder(network=network, grid=hand.own_grid)
+    else:
+        hand_encoder = given_hand_encoder(config.encoders)
+    aggregator = aggregator_over(
+        image_encoder,
+        hand_encoder,
         hand_width=part.hand_width,
         hidden=part.hidden,
         channels=part.network.masks.feature_channels,
     )
     return StageOneTask(
-        network=StageOne(FeatureAggregator(sizes), DualBranchFlow(part.network)).to(DEVICE),
+        network=StageOne(aggregator, DualBranchFlow(part.network)).to(DEVICE),
         image_encoder=image_encoder.to(DEVICE, torch.float32),
         hand_encoder=hand_encoder.to(DEVICE, torch.float32),
         vae=StructureVae(config.vae.network).to(DEVICE).eval().requires_grad_(False),

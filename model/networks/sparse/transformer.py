@@ -12,7 +12,6 @@ from model.networks.transformer import FeedForward, layer_norm
 __all__ = [
     "ModulatedSparseCrossBlock",
     "SparseTransformerBlock",
-    "initialise_sparse_transformer",
     "scale_and_shift",
     "shifted_windows",
 ]
@@ -74,23 +73,6 @@ def scale_and_shift(
     # Sample by sample: nothing of the size of the features is kept for the factors.
     rows = zip(x.features.split(x.grid.sample_sizes), scale, shift, strict=True)
     return x.with_features(torch.cat([part * (1 + factor) + offset for part, factor, offset in rows]))
-
-
-def initialise_sparse_transformer(network: nn.Module, *, t_embedder: nn.Module | None) -> None:
-    """As `initialise_transformer`, without its output layer: linear layers Xavier-uniform with zero bias, the time
-    MLP N(0, 0.02²), adaLN zero. Convolutions stay as their blocks drew them."""
-    for module in network.modules():
-        if isinstance(module, nn.Linear):
-            nn.init.xavier_uniform_(module.weight)
-            nn.init.zeros_(module.bias)
-    for module in t_embedder.modules() if t_embedder is not None else ():
-        if isinstance(module, nn.Linear):
-            nn.init.normal_(module.weight, std=0.02)
-    for module in network.modules():
-        if isinstance(module, ModulatedSparseCrossBlock):
-            modulation = module.adaLN_modulation[1]
-            assert isinstance(modulation, nn.Linear)
-            nn.init.zeros_(modulation.weight)
 
 
 def _gated(x: SparseTensor, gate: Float[Tensor, "batch channel"]) -> SparseTensor:

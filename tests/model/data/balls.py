@@ -2,9 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 from model.crop import Augmentation
+from model.data import ShardStream
+from model.sample import Batch
 from model.stream_config import StreamConfig
 from shards.schema import FrameRow
 from shards.splits import Split, SplitRule, split_of_object
@@ -41,6 +44,14 @@ def stream_config(*datasets: object, **changes: object) -> StreamConfig:
         "max_corrupt": 0,
     }
     return StreamConfig(**(settings | changes))  # type: ignore[arg-type]
+
+
+def take(stream: ShardStream, n: int) -> list[Batch]:
+    """The next n batches, and the end of the loader processes."""
+    try:
+        return list(islice(stream, n))
+    finally:
+        stream.close()
 
 
 def uid_of_split(split: Split, number: int, rule: SplitRule = SPLIT_RULE) -> str:

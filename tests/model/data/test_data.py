@@ -26,20 +26,13 @@ from shards.reader import open_dataset
 from shards.records import write_record
 from shards.schema import FrameRow
 from shards.splits import SplitRule
-from tests.model.data.balls import stream_config, uid_of_split, write_balls
+from tests.model.data.balls import stream_config, take, uid_of_split, write_balls
 
 
 @pytest.fixture(scope="module")
 def balls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two shards, three training motions and one for validation, three cameras; do not change it."""
     return write_balls(tmp_path_factory.mktemp("data") / "balls")
-
-
-def take(stream: ShardStream, n: int) -> list[Batch]:
-    try:
-        return list(islice(stream, n))
-    finally:
-        stream.close()
 
 
 def assert_same(a: Batch, b: Batch, rows: slice = slice(None)) -> None:

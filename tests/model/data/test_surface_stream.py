@@ -1,7 +1,6 @@
 """Surface samples in the stream: only when asked for, each sample's own, mirrored with everything else."""
 
 from dataclasses import replace
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -12,22 +11,14 @@ from model.crop import mirrored
 from model.data import ShardStream
 from model.data_order import SampleKey
 from model.errors import ModelError
-from model.sample import Batch
 from model.sample_reader import SampleReader
 from shards.reader import open_dataset
-from tests.model.data.balls import VARIED, stream_config, write_balls
+from tests.model.data.balls import VARIED, stream_config, take, write_balls
 
 
 @pytest.fixture(scope="module")
 def balls(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_balls(tmp_path_factory.mktemp("data") / "balls")
-
-
-def take(stream: ShardStream, n: int) -> list[Batch]:
-    try:
-        return list(islice(stream, n))
-    finally:
-        stream.close()
 
 
 def test_surfaces_are_read_only_when_asked_for(balls):

@@ -17,9 +17,11 @@ from model.networks.lora import (
     trainable_parameters,
 )
 from model.sparse_structure.geometry_branch import GeometryBranch, GeometryBranchConfig
+from tests.model.networks.paper_adapters import paper_adapters
 
 PAPER_LORA = LoraSettings(rank=64, alpha=128, dropout=0.0)
 SMALL_LORA = LoraSettings(rank=3, alpha=6, dropout=0.0)
+
 PAPER = GeometryBranchConfig(
     latent_resolution=16,
     latent_channels=8,
@@ -78,19 +80,7 @@ def test_paper_config_trains_exactly_these_parameters() -> None:
     with torch.device("meta"):
         branch = GeometryBranch(PAPER)
         add_lora(branch, PAPER_LORA)
-    shapes = {
-        "self_attn.to_qkv": (3072, 1024),
-        "self_attn.to_out": (1024, 1024),
-        "cross_attn.to_q": (1024, 1024),
-        "cross_attn.to_kv": (2048, 1024),
-        "cross_attn.to_out": (1024, 1024),
-    }
-    expected = {}
-    for j in range(24):
-        for layer, (rows, columns) in shapes.items():
-            expected[f"blocks.{j}.{layer}.lora_A.default.weight"] = (64, columns)
-            expected[f"blocks.{j}.{layer}.lora_B.default.weight"] = (rows, 64)
-    assert trainable_parameters(branch) == expected
+    assert trainable_parameters(branch) == paper_adapters()
     assert sum(p.numel() for p in branch.parameters() if p.requires_grad) == 20_447_232
 
 

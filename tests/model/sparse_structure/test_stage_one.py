@@ -4,8 +4,6 @@ import math
 
 import pytest
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.flow import Guidance, SamplerSettings, UniformTime
@@ -17,22 +15,7 @@ from model.sparse_structure.stage_one import FIGURES, StageOne, StageOneConfig, 
 from model.sparse_structure.vae import StructureVae, VaeConfig
 from model.sparse_structure.vae_training import turned
 from model.training.draws import sample_generators
-
-
-class MeanColor:
-    """A frozen encoder: mean colour of each cell."""
-
-    def __init__(self, grid: int) -> None:
-        self.grid, self.channels = grid, 3
-
-    def to(self, device, dtype) -> "MeanColor":
-        return self
-
-    def __call__(
-        self, images: Float[Tensor, "batch view 3 size size"]
-    ) -> Float[Tensor, "batch view token channel"]:
-        cells = torch.nn.functional.adaptive_avg_pool2d(images.flatten(0, 1), self.grid)
-        return cells.flatten(2).transpose(1, 2).unflatten(0, images.shape[:2])
+from tests.model.encoders.mean_color import MeanColor
 
 
 @pytest.fixture
@@ -134,13 +117,13 @@ def test_prediction_is_repeatable_and_has_the_sizes_of_its_inputs(task, batch):
 
 
 def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
-    evaluation = task.evaluate(task.module, [batch])
+    evaluation = task.evaluate([batch])
     assert tuple(evaluation.figures) == FIGURES
     assert evaluation.figures["visible_iou"] == pytest.approx(0.5)
     assert evaluation.figures["occluded_visible_iou"] == pytest.approx(0.5)
     assert evaluation.figures["occluded_mask_iou"] == evaluation.figures["mask_iou"]
     batch.object_visible[:] = batch.object_amodal
-    assert math.isnan(task.evaluate(task.module, [batch]).figures["occluded_mask_iou"])
+    assert math.isnan(task.evaluate([batch]).figures["occluded_mask_iou"])
     assert 0.0 <= evaluation.figures["mask_iou"] <= 1.0
     assert evaluation.pictures["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
 

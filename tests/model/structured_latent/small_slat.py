@@ -34,6 +34,20 @@ FLOW = SlatFlowConfig(
     checkpoint_blocks=False,
     preconditioned=False,
 )
+PAPER_FLOW = SlatFlowConfig(
+    resolution=64,
+    latent_channels=8,
+    channels=1024,
+    condition_channels=1024,
+    blocks=24,
+    heads=16,
+    mlp_ratio=4,
+    patch=2,
+    io_channels=(128,),
+    pool_pseudo_count=1,
+    checkpoint_blocks=True,
+    preconditioned=False,
+)
 TWO_LEVELS = replace(FLOW, patch=4, io_channels=(8, 16))
 
 

@@ -23,8 +23,10 @@ from model.networks.sparse.blocks import SparseResBlock3d
 from model.networks.sparse.tensor import SparseTensor
 from model.networks.transformer import ModulatedCrossBlock
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
+from tests.model.networks.paper_adapters import paper_adapters
 from tests.model.structured_latent.small_slat import (
     FLOW,
+    PAPER_FLOW,
     TWO_LEVELS,
     one_sample,
     trained,
@@ -227,36 +229,10 @@ LORA = LoraSettings(rank=3, alpha=6, dropout=0.0)
 
 def test_paper_adapters_are_those_of_stage_one() -> None:
     """Rank 64 on every projection of every attention of the published size, and nothing else."""
-    paper = SlatFlowConfig(
-        resolution=64,
-        latent_channels=8,
-        channels=1024,
-        condition_channels=1024,
-        blocks=24,
-        heads=16,
-        mlp_ratio=4,
-        patch=2,
-        io_channels=(128,),
-        pool_pseudo_count=1,
-        checkpoint_blocks=True,
-        preconditioned=False,
-    )
     with torch.device("meta"):
-        flow = SlatFlow(paper)
+        flow = SlatFlow(PAPER_FLOW)
         add_lora(flow, LoraSettings(rank=64, alpha=128, dropout=0.0))
-    layers = {
-        "self_attn.to_qkv": (3072, 1024),
-        "self_attn.to_out": (1024, 1024),
-        "cross_attn.to_q": (1024, 1024),
-        "cross_attn.to_kv": (2048, 1024),
-        "cross_attn.to_out": (1024, 1024),
-    }
-    expected = {}
-    for j in range(24):
-        for layer, (rows, columns) in layers.items():
-            expected[f"blocks.{j}.{layer}.lora_A.default.weight"] = (64, columns)
-            expected[f"blocks.{j}.{layer}.lora_B.default.weight"] = (rows, 64)
-    assert trainable_parameters(flow) == expected
+    assert trainable_parameters(flow) == paper_adapters()
 
 
 def test_adapters_start_without_effect_train_merge_and_travel(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
@@ -22,6 +20,7 @@ from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.surface.extraction import ExtractionConfig
 from model.training.draws import sample_generators
 from model.training.task import Task
+from tests.model.encoders.mean_color import MeanColor
 from tests.model.structured_latent.solids import ball, ball_distance, batch_of, plate, plate_distance, shell
 
 VAE = SlatVaeConfig(
@@ -53,22 +52,6 @@ LOSS = SurfaceLossConfig(
     distance=1.0, surface=0.3, normal=0.1, corner=0.3, color=1.0, deformation=1.0, kl=1e-4, truncation=1.0
 )
 MESHES = MeshEvaluationConfig(extraction=ExtractionConfig(seal=1), samples=5000)
-
-
-class MeanColor:
-    """A frozen encoder: mean colour of each cell."""
-
-    def __init__(self, grid: int) -> None:
-        self.grid, self.channels = grid, 3
-
-    def to(self, device, dtype) -> "MeanColor":
-        return self
-
-    def __call__(
-        self, images: Float[Tensor, "batch view 3 size size"]
-    ) -> Float[Tensor, "batch view token channel"]:
-        cells = torch.nn.functional.adaptive_avg_pool2d(images.flatten(0, 1), self.grid)
-        return cells.flatten(2).transpose(1, 2).unflatten(0, images.shape[:2])
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +110,7 @@ def test_the_vae_learns_two_objects(vae_task, batch):
         optimizer.step()
         optimizer.zero_grad()
     assert float(losses.total.detach()) < 0.35 * first
-    figures = vae_task.evaluate(vae_task.module, [batch]).figures
+    figures = vae_task.evaluate([batch]).figures
     assert figures["f_5mm"] > 99
     assert figures["manifold"] == 100
     assert figures["normal_deg"] < 20
@@ -185,7 +168,7 @@ def test_true_latents_come_back_through_normalisation(flow_task, batch):
 
 
 def test_the_table_shows_what_is_learned(flow_task, batch):
-    evaluation = flow_task.evaluate(flow_task.module, [batch])
+    evaluation = flow_task.evaluate([batch])
     for name in ("f_5mm", "mean_latent_f_5mm", "true_latent_f_5mm", "latent_error"):
         assert name in evaluation.figures
     picture = next(iter(evaluation.pictures.values()))

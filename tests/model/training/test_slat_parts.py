@@ -12,9 +12,14 @@ from safetensors.torch import load_file
 from model.config import TrainingConfig, as_yaml
 from model.data import ShardStream
 from model.errors import ModelError
+from model.networks.lora import LoraSettings
 from model.slat_config import SlatTrainingConfig, load_any_config, parse_any_config
+from model.structured_latent.flow import SlatFlow
+from model.structured_latent.latent import LatentNormalisation
 from model.training.checkpoint import latest_checkpoint
 from model.training.slat_parts import SLAT_PARTS, load_slat_flow, train_slat_part
+from model.weights.slat import SLAT_FLOW
+from model.weights.weight_file import write_weight_file
 from shards.settings import SettingsError
 from tests.model.data.balls import write_balls
 
@@ -123,6 +128,26 @@ def test_the_trained_flow_predicts_from_pictures(config, finished):
     prediction = task.predict(batch.images, batch.occupancy, torch.Generator().manual_seed(0))
     assert prediction.fields(0).resolution == 64
     assert torch.isfinite(prediction.decoded.features).all()
+
+
+def test_a_flow_with_adapters_is_used_with_the_weights_that_it_started_from(config, finished, tmp_path):
+    published = SlatFlow(config.slat_flow.network)
+    start = tmp_path / "start.safetensors"
+    tensors = {f"{SLAT_FLOW}{name}": value for name, value in published.state_dict().items()}
+    normalisation = LatentNormalisation.identity(config.slat_flow.network.latent_channels).state_dict()
+    tensors |= {f"stage_two.normalisation.{name}": value for name, value in normalisation.items()}
+    write_weight_file(start, tensors, sources={})
+    part = replace(config.slat_flow, start=start, lora=LoraSettings(rank=2, alpha=4, dropout=0.0))
+    adapted = replace(config, slat_flow=part)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "slat_vae").symlink_to(finished / "slat_vae")
+    _, steps = train("slat_flow", adapted, tmp_path / "run")
+    assert steps == [1, 2]
+    flow = load_slat_flow(adapted, tmp_path / "run", torch.device("cpu")).network.flow
+    held = flow.state_dict()
+    assert any("lora_A" in name for name in held)
+    name = "blocks.0.mlp.mlp.0.weight"
+    torch.testing.assert_close(held[name], published.state_dict()[name], rtol=0, atol=0)
 
 
 def test_the_flow_without_its_vae_says_what_to_train(config, tmp_path):

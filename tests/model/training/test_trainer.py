@@ -191,7 +191,7 @@ def test_validation_uses_the_averaged_weights_and_takes_them_back(tmp_path):
 
     def validate():
         seen.append({name: p.detach().clone() for name, p in task.module.named_parameters()})
-        return task.evaluate(task.module, [next(ToySource(2).batches(0, 0)).batch])
+        return task.evaluate([next(ToySource(2).batches(0, 0)).batch])
 
     train(
         task,

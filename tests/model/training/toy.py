@@ -102,7 +102,7 @@ class ToyTask:
         error = (predicted - batch.images.mean(dim=(1, 3, 4))).square().mean()
         return Losses(total=error, parts={"color": error})
 
-    def evaluate(self, module: nn.Module, batches: Iterable[Batch]) -> Evaluation:
+    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         errors = [self.loss(batch, [torch.Generator() for _ in batch.ids]).total for batch in batches]
         return Evaluation(
             figures={"error": float(torch.stack(errors).mean())},

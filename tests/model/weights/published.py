@@ -1,12 +1,15 @@
 """Files like those that TRELLIS publishes, with random values, for networks of any size."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import torch
 from safetensors.torch import save_file
 from torch import nn
 
+from model.errors import ModelError
 from model.networks.embeddings import sincos_position_embedding
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.geometry_branch import GeometryBranchConfig
@@ -87,3 +90,14 @@ def write_published(
         save_file(written[name], folder / f"{name}_fp16.safetensors")
         (folder / f"{name}_fp16.json").write_text(json.dumps({"name": CLASSES[name], "args": {}}))
     return written
+
+
+def refused(make: Callable[[], object], out: Path, *parts: str) -> str:
+    """The one line that says all of `parts`; no weight file."""
+    with pytest.raises(ModelError) as caught:
+        make()
+    text = str(caught.value)
+    assert "\n" not in text
+    assert all(part in text for part in parts), text
+    assert not out.exists()
+    return text

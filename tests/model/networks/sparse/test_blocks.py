@@ -14,10 +14,9 @@ from model.networks.sparse.tensor import SparseTensor
 from model.networks.sparse.transformer import (
     ModulatedSparseCrossBlock,
     SparseTransformerBlock,
-    initialise_sparse_transformer,
     shifted_windows,
 )
-from model.networks.transformer import ModulatedCrossBlock
+from model.networks.transformer import ModulatedCrossBlock, initialise_transformer
 
 
 @pytest.fixture(autouse=True)
@@ -205,7 +204,7 @@ def test_windows_shift_in_every_other_block() -> None:
 
 def test_modulation_starts_closed() -> None:
     block = _modulated()
-    initialise_sparse_transformer(block, t_embedder=None)
+    initialise_transformer(block, t_embedder=None)
     assert not block.adaLN_modulation[1].weight.any()
     assert block.self_attn.to_qkv.weight.any()
 
