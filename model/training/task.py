@@ -42,4 +42,4 @@ class Task(Protocol):
         """Loss of a batch. All randomness comes from the generators, one per sample (`draws.py`)."""
 
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Figures with the given (averaged) weights; no gradients, randomness of its own fixed seed."""
+        """Figures with the weights that the module holds now; no gradients, randomness of its own fixed seed."""
