@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import cv2
+import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
@@ -199,6 +200,9 @@ def _unchanged(delivery: Any) -> Any:
 def _start_worker(_: int) -> None:
     cv2.setNumThreads(0)  # one thread per loader process, or they fight for the cores
     torch.set_num_threads(1)
+    # glibc gives freed memory back above twice the largest block freed so far, and each sample would fault its pages in
+    # anew; one large block (glibc's limit is 32 MB) keeps the memory of a batch with the process.
+    np.empty(31 << 20, np.uint8)
     # Ctrl-C and the scheduler's SIGTERM reach the whole process group, and are the main process's to handle: it saves
     # and then ends its workers. Should it die, torch's watchdog ends them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
