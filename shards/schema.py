@@ -1,20 +1,17 @@
 """Every column of the three files of a shard, described once.
 
 `ObjectRow`, `ClipRow` and `FrameRow` are one row of objects.parquet, clips.parquet and
-frames.parquet. The Arrow schema, the checks on rows and the README table come from them.
-`python -m shards.schema` prints that table; with a path it updates it inside that file.
+frames.parquet. The Arrow schema, the checks on rows and the README tables (column_tables.py) come from them.
 """
 
 # ruff: noqa: RUF009  (`column` is `dataclasses.field` with metadata: it makes no shared default)
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from shards.array_types import Float, Int, UInt8
-from shards.columns import column, markdown_table
+from shards.columns import column
 
 __all__ = [
     "CONVENTIONS",
@@ -25,7 +22,6 @@ __all__ = [
     "ClipRow",
     "FrameRow",
     "ObjectRow",
-    "readme_tables",
 ]
 
 SCHEMA_VERSION = "1.0.0"
@@ -388,29 +384,3 @@ class FrameRow:
 
 
 ROW_TYPES = {"objects": ObjectRow, "clips": ClipRow, "frames": FrameRow}
-
-_BEGIN, _END = "<!-- columns: python -m shards.schema shards/README.md -->\n", "<!-- end of columns -->\n"
-
-
-def readme_tables() -> str:
-    """The column tables of the three files, as they stand in README.md."""
-    parts = [
-        f"### {name}.parquet\n\n{(row_type.__doc__ or '').strip()}\n\n{markdown_table(row_type)}\n"
-        for name, row_type in ROW_TYPES.items()
-    ]
-    return "\n".join(parts)
-
-
-def update_readme(text: str) -> str:
-    """`text` with the block between the two markers replaced by the current tables."""
-    before, rest = text.split(_BEGIN)
-    after = rest.split(_END)[1]
-    return f"{before}{_BEGIN}\n{readme_tables()}\n{_END}{after}"
-
-
-if __name__ == "__main__":
-    if len(sys.argv) == 1:
-        sys.stdout.write(readme_tables())
-    else:
-        readme = Path(sys.argv[1])
-        readme.write_text(update_readme(readme.read_text(encoding="utf-8")), encoding="utf-8")

@@ -10,9 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from shards.column_tables import update_readme
 from shards.columns import arrow_schema, columns_of, rows_from_table, table_from_rows
 from shards.errors import RowError
-from shards.schema import DIGITS, JOINTS, ROW_TYPES, ObjectRow, update_readme
+from shards.schema import DIGITS, JOINTS, ROW_TYPES, ObjectRow
 from tests.shards.synthetic import synthetic_clip, synthetic_object
 
 README = Path(__file__).parents[2] / "shards" / "README.md"
@@ -20,7 +21,7 @@ README = Path(__file__).parents[2] / "shards" / "README.md"
 
 def test_readme_tables_are_up_to_date():
     text = README.read_text(encoding="utf-8")
-    assert update_readme(text) == text, "run: python -m shards.schema shards/README.md"
+    assert update_readme(text) == text, "run: python -m shards.column_tables shards/README.md"
 
 
 @pytest.mark.parametrize("row_type", ROW_TYPES.values())
