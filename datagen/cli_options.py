@@ -1,10 +1,6 @@
 """What the commands of `datagen` share: options, error lines, default folders."""
 
-import functools
-import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -13,12 +9,15 @@ from datagen.objects.licences import spdx_of
 from datagen.pipeline import PipelineError
 from datagen.plan import PlanError
 from shards.errors import ShardError
+from shards.plain_errors import plain_errors as plain_errors_of
 from shards.settings import SettingsError
 
 __all__ = ["config_option", "default_out", "license_option", "out_option", "plain_errors", "workers_option"]
 
 USER_ERRORS = (SettingsError, PlanError, PipelineError, InputError, ShardError)
 DEFAULT_CONFIG = Path("configs/datagen/tiny.yaml")
+
+plain_errors = plain_errors_of("datagen", dict.fromkeys(USER_ERRORS, 2))
 
 config_option = click.option(
     "--config",
@@ -32,7 +31,7 @@ out_option = click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=None,
-    help="Dataset folder.  [default: data/<name of the configuration>]",
+    help="Dataset folder.  [default: data/NAME for a configuration NAME.yaml]",
 )
 workers_option = click.option(
     "--workers",
@@ -65,20 +64,6 @@ license_option = click.option(
     metavar="LIST",
     help="Licences to allow, for example cc0,by.  [default: selection.licence_allow of the configuration]",
 )
-
-
-def plain_errors(command: Callable[..., Any]) -> Callable[..., Any]:
-    """What a user can cause ends as one clear message and exit status 2; the rest is a bug and shows a trace."""
-
-    @functools.wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        try:
-            return command(*args, **kwargs)
-        except USER_ERRORS as error:
-            click.echo(f"datagen: {error}", err=True)
-            sys.exit(2)
-
-    return wrapped
 
 
 def default_out(config_path: Path) -> Path:

@@ -17,7 +17,7 @@ from model.figures_table import figures_table
 from model.slat_config import SlatTrainingConfig, load_any_config
 from model.training.parts import PARTS, train_part, trained_parts
 from model.training.progress import TrainingProgress
-from model.training.slat_parts import SLAT_PARTS, train_slat_part
+from model.training.slat_parts import SLAT_PARTS, train_slat_part, trained_slat_parts
 from model.training.trainer import StepReport
 
 __all__ = ["main"]
@@ -54,7 +54,7 @@ main.add_command(reconstruct_command)
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
     default=None,
-    help="Folder of checkpoints and logs.  [default: runs/<name of the configuration>]",
+    help="Folder of checkpoints and logs.  [default: runs/NAME for a configuration NAME.yaml]",
 )
 @plain_errors
 def train(what: str, config_path: Path, out: Path | None) -> None:
@@ -72,7 +72,7 @@ def train(what: str, config_path: Path, out: Path | None) -> None:
     one_part = what in (*PARTS, *SLAT_PARTS)
     path = config_path if one_part else Path(what)
     config = load_any_config(path)
-    names = SLAT_PARTS if isinstance(config, SlatTrainingConfig) else trained_parts(config)
+    names = trained_slat_parts(config) if isinstance(config, SlatTrainingConfig) else trained_parts(config)
     if one_part:
         names = (_part_of(config, what, path),)
     folder = out or Path("runs") / path.stem

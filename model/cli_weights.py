@@ -12,6 +12,7 @@ from model.weights.merging import export_run_adapter, merge_run
 from model.weights.published import ImportReport, import_networks
 from model.weights.slat import slat_networks
 from model.weights.trellis import stage_one_networks
+from model.weights.weight_file import StartConfig
 
 __all__ = ["weights"]
 
@@ -48,12 +49,13 @@ def weights() -> None:
 def import_weights(source: Path, config_path: Path, out: Path) -> None:
     """Convert published TRELLIS weights of the configuration's stage: SOURCE is a folder of them, or one file.
 
-    The file that is written is what `vae.weights` and `stage_one.start.weights`, or `slat_flow.start`, of a
-    configuration name.
+    The file that is written is what `vae.weights` and `stage_one.start.weights`, or `slat_vae.weights` and
+    `slat_flow.start`, of a configuration name.
 
     \b
     Example:
       forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
+      forehoi weights import TRELLIS-image-large --config configs/model/paper_slat.yaml --out weights/slat.safetensors
     """
     config = load_any_config(config_path)
     if isinstance(config, SlatTrainingConfig):
@@ -80,6 +82,8 @@ def import_weights(source: Path, config_path: Path, out: Path) -> None:
 def merge(run: Path, out: Path) -> None:
     """Merge the adapters of a run into the weights that it started from; everything else it trained comes along.
 
+    RUN is of stage 1 or of stage 2.
+
     \b
     Example:
       forehoi weights merge runs/paper --out weights/paper.safetensors
@@ -87,10 +91,10 @@ def merge(run: Path, out: Path) -> None:
     start = merge_run(run, out)
     console = Console()
     console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
-    console.print(
-        f"to start from it: start: {{weights: {start.weights}, latent_scale: {start.latent_scale}}}",
-        soft_wrap=True,
-    )
+    named = str(start)
+    if isinstance(start, StartConfig):
+        named = f"{{weights: {start.weights}, latent_scale: {start.latent_scale}}}"
+    console.print(f"to start from it: start: {named}", soft_wrap=True)
 
 
 @weights.command("export-adapter")
@@ -105,7 +109,7 @@ def merge(run: Path, out: Path) -> None:
 def export(run: Path, out: Path) -> None:
     """Write the adapter of a run for the peft library: adapter_config.json and adapter_model.safetensors.
 
-    It adapts the geometry branch alone; mask branch, fusion and aggregator are in the run's checkpoint.
+    It adapts the geometry branch, or the SLat flow, alone; what else was trained is in the run's checkpoint.
 
     \b
     Example:

@@ -169,11 +169,10 @@ class TrainingConfig:
 
     def __post_init__(self) -> None:
         require_held_out(self.data, self.validation)
-        network, image = self.stage_one.network, self.encoders.image
-        grid = getattr(image, "grid", None)
-        if grid is not None and network.masks.grid != grid:
+        network, grid = self.stage_one.network, self.encoders.image.grid
+        if network.masks.grid != grid:
             raise ValueError(
-                f"stage_one.network.masks.grid is {network.masks.grid} and encoders.image.grid {grid}: "
+                f"stage_one.network.masks.grid is {network.masks.grid} and the grid of encoders.image {grid}: "
                 "mask tokens lie on the image tokens; expected the same number"
             )
         latent = self.vae.network.latent_shape(64)

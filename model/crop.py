@@ -191,6 +191,7 @@ def mirrored_surface(surface: ObjectSurface) -> ObjectSurface:
         points=surface.points * F,
         normals=surface.normals * F,
         sdf_points=surface.sdf_points * F,
+        is_mirrored=not surface.is_mirrored,
     )
 
 

@@ -36,6 +36,7 @@ class ObjectSurface:
     sdf_points: Float32[np.ndarray, "sample 3"]
     sdf_values: Float32[np.ndarray, "sample"]  # negative inside
     object_scale_m: float  # metres per canonical unit
+    is_mirrored: bool = False  # x -> -x of the object that the shard holds
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,6 +73,7 @@ class SurfaceBatch:
     sdf_counts: tuple[int, ...]
     object_uids: tuple[str, ...]
     object_scales_m: tuple[float, ...]
+    are_mirrored: tuple[bool, ...]
 
     def part(self, start: int, stop: int) -> "SurfaceBatch":
         """The samples start .. stop - 1."""
@@ -88,6 +90,7 @@ class SurfaceBatch:
             sdf_counts=self.sdf_counts[chosen],
             object_uids=self.object_uids[chosen],
             object_scales_m=self.object_scales_m[chosen],
+            are_mirrored=self.are_mirrored[chosen],
         )
 
     def to(self, device: torch.device | str) -> "SurfaceBatch":
@@ -188,6 +191,7 @@ def join_surfaces(
         sdf_counts=tuple(len(surface.sdf_points) for surface in surfaces),
         object_uids=tuple(object_uids),
         object_scales_m=tuple(surface.object_scale_m for surface in surfaces),
+        are_mirrored=tuple(surface.is_mirrored for surface in surfaces),
     )
 
 

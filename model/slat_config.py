@@ -17,23 +17,41 @@ from model.config import (
 from model.flow import LogitNormalTime, SamplerSettings, UniformTime
 from model.networks.lora import LoraSettings
 from model.stream_config import StreamConfig
-from model.structured_latent.features import FEATURE_CHANNELS
+from model.structured_latent.features import FEATURE_CHANNELS, SurfaceFeatures
 from model.structured_latent.flow import SlatFlowConfig
 from model.structured_latent.latent import SlatVaeConfig
 from model.structured_latent.mesh_evaluation import MeshEvaluationConfig
 from model.structured_latent.surface_loss import SurfaceLossConfig
+from model.structured_latent.view_features import ViewFeaturesConfig
 from shards.settings import settings_from_dict
 
-__all__ = ["SlatFlowPart", "SlatTrainingConfig", "SlatVaePart", "load_any_config", "parse_any_config"]
+__all__ = [
+    "ImportedSlatVae",
+    "SlatFlowPart",
+    "SlatTrainingConfig",
+    "SlatVaePart",
+    "load_any_config",
+    "parse_any_config",
+]
 
 
 @dataclass(frozen=True, kw_only=True)
 class SlatVaePart:
-    """The structured-latent VAE."""
+    """The structured-latent VAE, trained here, and what its encoder reads of an object."""
 
     network: SlatVaeConfig
+    features: SurfaceFeatures | ViewFeaturesConfig
     loss: SurfaceLossConfig
     recipe: Recipe
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportedSlatVae:
+    """The structured-latent VAE with weights that are there already; not trained."""
+
+    network: SlatVaeConfig
+    features: SurfaceFeatures | ViewFeaturesConfig
+    weights: Path  # made by `forehoi weights import`
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,16 +88,18 @@ class SlatTrainingConfig:
     validation: ValidationConfig
     encoders: EncodersConfig
     meshes: MeshEvaluationConfig
-    slat_vae: SlatVaePart
+    slat_vae: SlatVaePart | ImportedSlatVae
     slat_flow: SlatFlowPart
 
     def __post_init__(self) -> None:
         require_held_out(self.data, self.validation)
         vae, flow = self.slat_vae.network, self.slat_flow.network
-        if vae.feature_channels != FEATURE_CHANNELS:
+        own_surface = isinstance(self.slat_vae.features, SurfaceFeatures)
+        if own_surface and vae.feature_channels != FEATURE_CHANNELS:
             raise ValueError(
                 f"slat_vae.network.feature_channels is {vae.feature_channels}: expected {FEATURE_CHANNELS}, the "
-                "features of an object's own surface (model/structured_latent/features.py); shards hold no others"
+                "features of an object's own surface (slat_vae.features: {}); those of views, "
+                "{views: 150, image_size: 518, ...}, have the channels of encoders.image"
             )
         if (vae.latent_channels, vae.resolution) != (flow.latent_channels, flow.resolution):
             raise ValueError(

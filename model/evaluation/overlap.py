@@ -1,5 +1,7 @@
 """Overlap and distance of voxel shapes and masks, as they are printed while training."""
 
+import math
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -32,12 +34,13 @@ def mean_shape(shapes: Bool[Tensor, "shape i j k"]) -> Bool[Tensor, "i j k"]:
 
 
 def voxel_chamfer(predicted: Bool[Tensor, "i j k"], truth: Bool[Tensor, "i j k"]) -> float:
-    """Chamfer distance of occupied voxel centres, unit: the canonical cube's side; infinite when one is empty.
+    """Chamfer distance of occupied voxel centres, unit: the canonical cube's side.
 
-    Mean of the two mean nearest distances, unsquared.
+    Mean of the two mean nearest distances, unsquared. When one of the two is empty, the cube's diagonal, which
+    no two shapes in it are apart: nothing is never better than something.
     """
     a, b = ((occupied.nonzero().double() + 0.5) / occupied.shape[0] for occupied in (predicted, truth))
     if not len(a) or not len(b):
-        return float("inf")
+        return 0.0 if len(a) == len(b) else math.sqrt(3)
     to_b, to_a = KDTree(b.numpy()).query(a.numpy())[0], KDTree(a.numpy()).query(b.numpy())[0]
     return float(0.5 * (np.mean(to_b) + np.mean(to_a)))

@@ -20,7 +20,7 @@ from model.structured_latent.flow_training import SlatFlowTask
 from model.training.checkpoint import latest_checkpoint, read_state
 from model.training.config import TrainerConfig
 from model.training.parts import load_stage_one, trained_parts
-from model.training.slat_parts import SLAT_PARTS, load_slat_flow
+from model.training.slat_parts import SLAT_PARTS, load_slat_flow, trained_slat_parts
 
 __all__ = [
     "Checkpoint",
@@ -114,11 +114,14 @@ def open_stage_two(run: Path) -> StageTwoRun:
     """ModelError, naming the command that trains it, when the folder holds no trained stage 2."""
     config = _config(run, "slat_flow")
     assert isinstance(config, SlatTrainingConfig)
-    recipes = {"slat_vae": config.slat_vae.recipe, "slat_flow": config.slat_flow.recipe}
+    recipes = {"slat_vae": config.slat_vae, "slat_flow": config.slat_flow}
     return StageTwoRun(
         folder=run,
         config=config,
-        checkpoints=tuple(_checkpoint(run, part, recipes[part].trainer) for part in SLAT_PARTS),
+        checkpoints=tuple(
+            _checkpoint(run, part, recipes[part].recipe.trainer)  # type: ignore[union-attr]
+            for part in trained_slat_parts(config)
+        ),
     )
 
 

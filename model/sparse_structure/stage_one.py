@@ -1,6 +1,6 @@
 """Stage 1 as one module and its training: amodal masks and shape denoised together (paper, 3.1-3.3)."""
 
-import math
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from model.encoders.aggregator import FeatureAggregator
+from model.encoders.hand import HandNet
 from model.encoders.protocol import FeatureEncoder
 from model.evaluation.overlap import intersection_over_union, voxel_chamfer
 from model.flow import (
@@ -31,16 +32,19 @@ from model.sparse_structure.prediction import Prediction
 from model.sparse_structure.stage_one_pictures import prediction_rows
 from model.sparse_structure.vae import StructureVae, occupancy_from_logits
 from model.training.draws import normal_like, uniform
-from model.training.task import Evaluation, Losses
+from model.training.task import Evaluation, Losses, Measurements
 
 FIGURES = (
     "voxel_iou",
     "mean_shape_iou",  # of the mean training shape, for every object
-    "chamfer",  # share of the cube's side
+    "chamfer",  # share of the cube's side; of an empty shape, the cube's diagonal
+    "empty",  # share of the predicted shapes without any voxel
     "mask_iou",  # of found and true amodal masks
     "visible_iou",  # of the true visible mask in place of the amodal one
-    "occluded_mask_iou",  # the same two where at least OCCLUDED of the object is hidden
+    "found_visible_iou",  # of the visible mask that our hand network finds; NaN with another hand encoder
+    "occluded_mask_iou",  # the same three where at least OCCLUDED of the object is hidden
     "occluded_visible_iou",
+    "occluded_found_visible_iou",
 )
 OCCLUDED = 0.2
 
@@ -78,6 +82,7 @@ class StageOneTask:
     vae: StructureVae  # frozen
     config: StageOneConfig
     mean_shape: Bool[Tensor, "64 64 64"]  # of the training objects: what a prediction has to beat
+    hand_net: HandNet | None  # the hand encoder's, where it finds visible objects: another thing to beat
 
     @property
     def module(self) -> nn.Module:
@@ -144,40 +149,59 @@ class StageOneTask:
         logits = self.vae.decoder(clean["geometry"] * self.config.latent_scale)
         return Prediction(occupancy=occupancy_from_logits(logits), masks=clean["masks"][:, :, 0])
 
-    @torch.no_grad()
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Means of FIGURES over samples or views, with fixed noise; a figure without views is NaN."""
-        figures: dict[str, list[float]] = {name: [] for name in FIGURES}
+        """Means of FIGURES over samples or views; a figure without views is NaN."""
+        return self.measure(batches).evaluation()
+
+    @torch.no_grad()
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
+        """FIGURES of every sample or view, with noise that belongs to the batch."""
+        numbers: dict[str, list[float]] = {name: [] for name in FIGURES}
         pictures: dict[str, np.ndarray] = {}
-        generator = torch.Generator().manual_seed(0)
         for batch in batches:
-            found = self.predict(batch.images, generator)
-            for name, values in _scores(batch, found, self.mean_shape).items():
-                figures[name] += values.tolist()
+            found = self.predict(batch.images, _noise_of(batch))
+            scores = _scores(batch, found, self.mean_shape)
+            if self.hand_net is not None:
+                visible = self.hand_net.visible_object(batch.images.flatten(0, 1))
+                scores |= _mask_scores(batch, visible, "found_visible_iou")
+            for name, values in scores.items():
+                numbers[name] += values.tolist()
             if not pictures:
                 pictures = {"prediction": prediction_rows(batch, found)}
-        means = {name: sum(values) / len(values) if values else math.nan for name, values in figures.items()}
-        return Evaluation(figures=means, pictures=pictures)
+        return Measurements(numbers=numbers, pictures=pictures)
+
+
+def _noise_of(batch: Batch) -> torch.Generator:
+    """Always the same for the same samples, whatever was measured before."""
+    digest = hashlib.blake2b("\n".join(batch.ids).encode(), digest_size=4).digest()
+    return torch.Generator().manual_seed(int.from_bytes(digest))
 
 
 def _scores(
     batch: Batch, found: Prediction, mean_shape: Bool[Tensor, "64 64 64"]
 ) -> dict[str, Float[Tensor, " n"]]:
     guess = mean_shape.to(batch.occupancy.device).expand_as(batch.occupancy)
-    amodal, visible = batch.object_amodal.flatten(0, 1), batch.object_visible.flatten(0, 1)
-    masks = _full_size(found.masks, amodal.shape[-1]).flatten(0, 1) > 0
-    mask_iou, visible_iou = (intersection_over_union(mask, amodal) for mask in (masks, visible))
-    occluded = visible_iou < 1 - OCCLUDED  # a visible mask lies inside the amodal one
     chamfer = [voxel_chamfer(a.cpu(), b.cpu()) for a, b in zip(found.occupancy, batch.occupancy)]
+    masks = _full_size(found.masks, batch.images.shape[-1]).flatten(0, 1) > 0
     return {
         "voxel_iou": intersection_over_union(found.occupancy, batch.occupancy),
         "mean_shape_iou": intersection_over_union(guess, batch.occupancy),
         "chamfer": torch.tensor(chamfer),
-        "mask_iou": mask_iou,
-        "visible_iou": visible_iou,
-        "occluded_mask_iou": mask_iou[occluded],
-        "occluded_visible_iou": visible_iou[occluded],
+        "empty": (~found.occupancy.flatten(1).any(1)).float(),
+        **_mask_scores(batch, masks, "mask_iou"),
+        **_mask_scores(batch, batch.object_visible.flatten(0, 1), "visible_iou"),
     }
+
+
+def _mask_scores(
+    batch: Batch, masks: Bool[Tensor, "flat size size"], name: str
+) -> dict[str, Float[Tensor, " n"]]:
+    """IoU of masks with the amodal ones, of every view and of those where much of the object is hidden."""
+    amodal, visible = batch.object_amodal.flatten(0, 1), batch.object_visible.flatten(0, 1)
+    iou = intersection_over_union(masks, amodal)
+    # A visible mask lies inside the amodal one.
+    occluded = intersection_over_union(visible, amodal) < 1 - OCCLUDED
+    return {name: iou, f"occluded_{name}": iou[occluded]}
 
 
 @dataclass(frozen=True, eq=False)

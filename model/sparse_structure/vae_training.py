@@ -13,7 +13,7 @@ from model.evaluation.overlap import intersection_over_union
 from model.sample import Batch
 from model.sparse_structure.vae import StructureVae, VaeConfig, occupancy_from_logits
 from model.training.draws import normal_like, uniform
-from model.training.task import Evaluation, Losses
+from model.training.task import Evaluation, Losses, Measurements
 from model.training.voxel_picture import voxel_picture
 
 __all__ = ["VaeTask", "turned"]
@@ -54,18 +54,22 @@ class VaeTask:
         losses = self.network(occupancy, noise)
         return Losses(total=losses.total, parts={"dice": losses.dice.mean(), "kl": losses.kl.mean()})
 
-    @torch.no_grad()
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """voxel_iou of shapes through encoder and decoder; pictures: truth beside reconstruction."""
-        scores: list[Tensor] = []
+        return self.measure(batches).evaluation()
+
+    @torch.no_grad()
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
+        """voxel_iou of every shape."""
+        scores: list[float] = []
         pictures: dict[str, np.ndarray] = {}
         for batch in batches:
             decoded = occupancy_from_logits(self.network.decoder(self.network.encoder(batch.occupancy).mean))
-            scores.append(intersection_over_union(decoded, batch.occupancy))
+            scores += intersection_over_union(decoded, batch.occupancy).tolist()
             if not pictures:
                 rows = [
                     np.concatenate([voxel_picture(truth), voxel_picture(found)], axis=1)
                     for truth, found in zip(batch.occupancy.cpu(), decoded.cpu())
                 ]
                 pictures = {"truth_and_reconstruction": np.concatenate(rows[:4], axis=0)}
-        return Evaluation(figures={"voxel_iou": float(torch.cat(scores).mean())}, pictures=pictures)
+        return Measurements(numbers={"voxel_iou": scores}, pictures=pictures)

@@ -13,7 +13,9 @@ error is 0.06 voxels (median over objects 0.03, worst 0.23: an object of thin ba
 voxels hold no surface point (worst 85 %). It takes 0.13 s per object.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 import torch
@@ -24,11 +26,13 @@ from torch import Tensor
 from model.encoders.protocol import FeatureEncoder
 from model.errors import ModelError
 from model.sample import ObjectSurface
+from model.structured_latent.object_views import ObjectView
 from model.surface.fields import CORNERS
 
 __all__ = [
     "FEATURE_CHANNELS",
     "ProjectedFeatures",
+    "SurfaceFeatures",
     "VoxelFeatures",
     "corner_distances",
     "object_features",
@@ -39,6 +43,12 @@ FEATURE_CHANNELS = 16
 _LARGEST_DISTANCE = 2.0  # voxels; a corner of a voxel that the surface passes through is nearer than sqrt(3)
 _FULL_COUNT = 8  # surface points in a voxel beyond which more say nothing
 _GRADIENT_CANDIDATES = 4
+_VIEWS_AT_ONCE = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class SurfaceFeatures:
+    """Features of the object's own surface, `VoxelFeatures.rows`: nothing to choose."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,10 +148,9 @@ class ProjectedFeatures:
     views: Int[Tensor, "voxel"]  # that show the voxel's centre inside the picture, in front of the camera
 
 
+@torch.no_grad()
 def projected_features(
-    images: Float[Tensor, "view 3 size size"],
-    K: Float[Tensor, "view 3 3"],
-    T_cam_from_canonical: Float[Tensor, "view 4 4"],
+    views: Iterable[ObjectView],
     voxels: Int[Tensor, "voxel 3"],
     resolution: int,
     encoder: FeatureEncoder,
@@ -150,34 +159,35 @@ def projected_features(
 
     Without a visibility test, as TRELLIS: a voxel on the far side gets the features in front of it. Views that show
     the centre outside the picture do not count (TRELLIS, whose views show the whole object, counts them as zero).
-    `images` are sRGB, 0..1, pictures of the whole unoccluded object; K in their pixels.
+    Float32, on the device of `voxels`, where the encoder is too; the pictures are of the whole unoccluded object.
     """
-    centers = (voxels.to(K) + 0.5) / resolution - 0.5
-    total = torch.zeros(len(voxels), encoder.channels, dtype=torch.float32, device=images.device)
-    count = torch.zeros(len(voxels), dtype=torch.long, device=images.device)
-    for image, K_view, T in zip(images, K, T_cam_from_canonical, strict=True):
-        at, seen = _projected(centers, K_view, T, image.shape[-1])
-        tokens = encoder(image[None, None])[0, 0].float()
-        grid = tokens.T.unflatten(1, (encoder.grid, encoder.grid))[None]
-        # align_corners=False: token (r, c) is centred at (c + 0.5, r + 0.5) / grid of the sides, as encoders promise.
-        sampled = torch.nn.functional.grid_sample(
-            grid, at[None, None], mode="bilinear", padding_mode="border", align_corners=False
-        )[0, :, 0].T
-        total += torch.where(seen[:, None], sampled, 0.0)
-        count += seen
+    device, rest = voxels.device, iter(views)
+    centers = (voxels.float() + 0.5) / resolution - 0.5
+    total = torch.zeros(len(voxels), encoder.channels, device=device)
+    count = torch.zeros(len(voxels), dtype=torch.long, device=device)
+    while some := list(islice(rest, _VIEWS_AT_ONCE)):
+        images = torch.from_numpy(np.stack([view.image for view in some])).to(device)
+        tokens = encoder(images.permute(0, 3, 1, 2)[None].float() / 255)[0].float()
+        for view, of_view in zip(some, tokens, strict=True):
+            at, seen = _projected(centers, view)
+            grid = of_view.T.unflatten(1, (encoder.grid, encoder.grid))[None]
+            # align_corners=False: token (r, c) is centred at (c + 0.5, r + 0.5) / grid, as encoders promise.
+            sampled = torch.nn.functional.grid_sample(
+                grid, at[None, None], mode="bilinear", padding_mode="border", align_corners=False
+            )[0, :, 0].T
+            total += torch.where(seen[:, None], sampled, 0.0)
+            count += seen
     return ProjectedFeatures(features=total / count.clamp(min=1)[:, None], views=count)
 
 
 def _projected(
-    points: Float[Tensor, "point 3"],
-    K: Float[Tensor, "3 3"],
-    T_cam_from_canonical: Float[Tensor, "4 4"],
-    size: int,
+    points: Float[Tensor, "point 3"], view: ObjectView
 ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, "point"]]:
     """Projections in -1..1 over the picture, and whether they are inside and in front of the camera."""
-    points_cam = points @ T_cam_from_canonical[:3, :3].T + T_cam_from_canonical[:3, 3]
+    T, K = (torch.from_numpy(matrix).to(points) for matrix in (view.T_cam_from_canonical, view.K))
+    points_cam = points @ T[:3, :3].T + T[:3, 3]
     in_front = points_cam[:, 2] > 0
     homogeneous = points_cam @ K.T
     pixels = homogeneous[:, :2] / torch.where(in_front, homogeneous[:, 2], 1.0)[:, None]
-    at = 2.0 * pixels / size - 1.0
+    at = 2.0 * pixels / view.image.shape[0] - 1.0
     return at, in_front & (at.abs() <= 1.0).all(dim=1)

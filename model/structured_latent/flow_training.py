@@ -1,7 +1,7 @@
 """Training of the SLat flow: latents of the true voxels, denoised given views of the occluded object (section 3.3)."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -57,7 +57,7 @@ class SlatFlowTask:
     vae: SlatVae  # frozen
     config: SlatFlowTraining
     evaluation: MeshEvaluationConfig
-    inputs: ObjectInputs = field(default_factory=ObjectInputs)
+    inputs: ObjectInputs  # of the true objects, for training and figures
 
     @property
     def module(self) -> nn.Module:

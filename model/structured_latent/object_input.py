@@ -1,6 +1,7 @@
 """Batches of voxel features for the SLat encoder, each object's computed once."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
 from model.sample import Batch, ObjectSurface, SurfaceBatch
 from model.structured_latent.features import VoxelFeatures, object_features
+from model.structured_latent.view_features import ViewFeatures
 
 __all__ = ["ObjectInput", "ObjectInputs", "object_surface"]
 
@@ -23,14 +25,18 @@ _MAX_OBJECTS = 256  # mirrored ones count apart; an object takes about 1 MB
 class ObjectInput:
     """What encoder and loss read of a batch."""
 
-    features: SparseTensor  # 16 channels on the active voxels
+    features: SparseTensor  # on the active voxels
     corner_distances: Float[Tensor, "voxel 8"]  # voxels, negative inside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectInputs:
-    """Makes them, and keeps the last objects, recognised by their content. Not shared between processes."""
+    """Makes them, and keeps the last objects, recognised by their content. Not shared between processes.
 
+    `of_views` makes the features; None: those of the objects' own surfaces.
+    """
+
+    of_views: ViewFeatures | None
     _kept: BoundedCache[VoxelFeatures] = field(default_factory=lambda: BoundedCache(_MAX_OBJECTS), init=False)
 
     def __call__(self, batch: Batch) -> ObjectInput:
@@ -41,12 +47,24 @@ class ObjectInputs:
             for sample, occupancy in enumerate(batch.occupancy)
         ]
         device = batch.occupancy.device
-        rows = torch.from_numpy(np.concatenate([features.rows() for features in found]))
+        rows = torch.cat(self._rows(batch, found))
         distances = torch.from_numpy(np.concatenate([features.distances for features in found]))
         return ObjectInput(
-            features=SparseTensor(grid=SparseGrid.from_occupancy(batch.occupancy), features=rows.to(device)),
+            features=SparseTensor(
+                grid=SparseGrid.from_occupancy(batch.occupancy), features=rows.to(device).float()
+            ),
             corner_distances=distances.to(device),
         )
+
+    def _rows(self, batch: Batch, found: Sequence[VoxelFeatures]) -> list[Float[Tensor, "voxel channel"]]:
+        """What the encoder reads, sample by sample."""
+        if self.of_views is None:
+            return [torch.from_numpy(features.rows()) for features in found]
+        truth = batch.true_surface
+        return [
+            self.of_views.rows(uid, occupancy.cpu().numpy(), is_mirrored=is_mirrored)
+            for uid, occupancy, is_mirrored in zip(truth.object_uids, batch.occupancy, truth.are_mirrored)
+        ]
 
     def _features(self, occupancy: Bool[np.ndarray, "i j k"], surface: ObjectSurface) -> VoxelFeatures:
         digest = hashlib.blake2b(np.packbits(occupancy).tobytes(), digest_size=16)
@@ -75,4 +93,5 @@ def object_surface(truth: SurfaceBatch, sample: int) -> ObjectSurface:
         sdf_points=part.sdf_points.cpu().numpy(),
         sdf_values=part.sdf_values.cpu().numpy(),
         object_scale_m=part.object_scales_m[0],
+        is_mirrored=part.are_mirrored[0],
     )

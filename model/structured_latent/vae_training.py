@@ -1,7 +1,7 @@
 """Training of the SLat VAE on the surfaces of the shards' objects."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -49,7 +49,7 @@ class SlatVaeTask:
     network: SlatVae
     loss_config: SurfaceLossConfig
     evaluation: MeshEvaluationConfig
-    inputs: ObjectInputs = field(default_factory=ObjectInputs)
+    inputs: ObjectInputs
 
     @property
     def module(self) -> nn.Module:

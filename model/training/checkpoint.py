@@ -20,10 +20,20 @@ from torch import nn
 from model.errors import ModelError
 from model.training.ema import MovingAverage
 
-__all__ = ["TrainingState", "latest_checkpoint", "load_average", "load_checkpoint", "save_checkpoint"]
+__all__ = [
+    "TrainingState",
+    "delete_partial",
+    "latest_checkpoint",
+    "load_average",
+    "load_checkpoint",
+    "read_state",
+    "require_data",
+    "save_checkpoint",
+]
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _NAME = re.compile(r"step-(\d{8})")
+_PARTIAL = re.compile(r"\.step-\d{8}\.partial")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,6 +45,7 @@ class TrainingState:
     samples_consumed: int  # of the epoch, over all ranks
     config_yaml: str
     config_sha256: str
+    data_sha256: str  # of what is read, wherever it lies
     format_version: int = FORMAT_VERSION
 
 
@@ -68,6 +79,13 @@ def save_checkpoint(
     return path
 
 
+def delete_partial(folder: Path) -> None:
+    """Delete what killed processes left half-written. Nobody else may be training there."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if _PARTIAL.fullmatch(path.name):
+            shutil.rmtree(path)
+
+
 def latest_checkpoint(folder: Path) -> Path | None:
     """The newest complete checkpoint, or None."""
     found = _checkpoints(folder)
@@ -81,8 +99,9 @@ def load_checkpoint(
     optimizer: torch.optim.Optimizer,
     *,
     config_sha256: str,
+    data_sha256: str,
 ) -> TrainingState:
-    """Restore everything, to the bit. ModelError when it belongs to another configuration or is damaged."""
+    """Restore everything, to the bit. ModelError when it is of another configuration, of other data, or damaged."""
     state = read_state(path)
     if state.config_sha256 != config_sha256:
         raise ModelError(
@@ -91,6 +110,7 @@ def load_checkpoint(
             expected=f"configuration {config_sha256[:12]}",
             action="Continue with the configuration in its state.json, or train into another folder.",
         )
+    require_data(path, state, data_sha256)
     weights = _tensors(path / "weights.safetensors")
     _require_same(path / "weights.safetensors", set(weights), set(_trained(module)))
     module.load_state_dict(weights, strict=False)
@@ -110,22 +130,34 @@ def load_average(path: Path, module: nn.Module) -> TrainingState:
     return read_state(path)
 
 
+def require_data(path: Path, state: TrainingState, data_sha256: str) -> None:
+    """ModelError when a checkpoint was trained on other data."""
+    if state.data_sha256 != data_sha256:
+        raise ModelError(
+            path,
+            f"was trained on other data ({state.data_sha256[:12]})",
+            expected=f"the data that the configuration names now ({data_sha256[:12]})",
+            action="Name the same shards in the same order, wherever they lie, or train into another folder (--out).",
+        )
+
+
 def read_state(path: Path) -> TrainingState:
     """state.json of a checkpoint. ModelError when it is missing, damaged or of another version."""
     try:
         content = json.loads((path / "state.json").read_text(encoding="utf-8"))
-        state = TrainingState(**content)
-    except (OSError, ValueError, TypeError) as error:
+        version = content["format_version"]
+        state = TrainingState(**content) if version == FORMAT_VERSION else None
+    except (OSError, ValueError, TypeError, KeyError) as error:
         raise ModelError(
             path,
             f"is no checkpoint ({error})",
             expected="a folder step-<number> with state.json and three safetensors files",
             action="Name a checkpoint folder, or delete a damaged one to continue from the one before.",
         ) from error
-    if state.format_version != FORMAT_VERSION:
+    if state is None:
         raise ModelError(
             path,
-            f"has checkpoint format {state.format_version}",
+            f"has checkpoint format {version}",
             expected=f"format {FORMAT_VERSION}",
             action="Use the version of this package that wrote it.",
         )

@@ -1,4 +1,8 @@
-"""What decides the weights of a part: its configuration, the data, and the parts and files that it stands on."""
+"""What decides the weights of a part: its configuration, and the parts and files that it stands on.
+
+The content of the data decides them too, but where they lie does not, and a network is used where they are not: a
+checkpoint has the digest of its data beside that of its configuration (`TrainingState`), for training alone to check.
+"""
 
 import hashlib
 from dataclasses import replace
@@ -52,9 +56,10 @@ def sha256_of(*texts: str) -> str:
 
 
 def deciding_data(data: StreamConfig) -> StreamConfig:
-    """The data without what says only how they are loaded, and without what recipes replace."""
+    """The data without where they lie, without what says only how they are loaded and what recipes replace."""
     return replace(
         data,
+        datasets=("",),
         workers=0,
         prefetch_batches=1,
         cache_mb=0,

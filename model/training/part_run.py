@@ -4,6 +4,7 @@ RUN/<part>    checkpoints, TensorBoard logs, figures.json
 """
 
 import json
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import torch
 from accelerate import Accelerator
+from accelerate.utils import gather_object
 from torch import nn
 
 from model.config import Recipe, ValidationConfig
@@ -18,12 +20,12 @@ from model.data import ShardStream, open_motions, validation_config
 from model.errors import ModelError
 from model.sample import Batch
 from model.stream_config import StreamConfig
-from model.training.checkpoint import latest_checkpoint, load_average
+from model.training.checkpoint import latest_checkpoint, load_average, read_state, require_data
 from model.training.source import StreamSource
-from model.training.task import Evaluation, Task
+from model.training.task import Evaluation, SharedValidation, Task
 from model.training.trainer import StepReport, train
 
-__all__ = ["PartData", "load_part", "one_pass", "part_data", "run_part"]
+__all__ = ["PartData", "load_part", "one_pass", "part_data", "require_same_data", "run_part"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,11 +36,11 @@ class PartData:
     held_out: StreamConfig
     batches: int
 
-    def validation(self, device: torch.device) -> Iterator[Batch]:
-        """The same held-out views every time."""
+    def validation(self, device: torch.device, rank: int = 0, ranks: int = 1) -> Iterator[Batch]:
+        """The same held-out views every time: every `ranks`-th batch from `rank` on. Each rank reads them all."""
         stream = ShardStream(self.held_out)
         try:
-            for batch in islice(stream, self.batches):
+            for batch in islice(stream, rank, self.batches, ranks):
                 yield batch.to(device, torch.float32)
         finally:
             stream.close()
@@ -89,7 +91,7 @@ def run_part(
     last: list[Evaluation] = []
 
     def validate() -> Evaluation:
-        last[:] = [task.evaluate(data.validation(accelerator.device))]
+        last[:] = [_evaluation(task, data, accelerator)]
         return last[0]
 
     train(
@@ -109,14 +111,44 @@ def run_part(
         load_part(folder, task.module, config_sha256=config_sha256)
         validate()
     if last and accelerator.is_main_process:
-        path.write_text(json.dumps(last[0].figures, indent=2), encoding="utf-8")
+        _write_figures(path, last[0].figures)
     accelerator.wait_for_everyone()
-    figures: dict[str, float] = json.loads(path.read_text(encoding="utf-8"))
-    return figures
+    return _read_figures(path)
+
+
+def require_same_data(folder: Path, data: PartData) -> None:
+    """ModelError when the part in `folder` is trained, but on other data."""
+    path = latest_checkpoint(folder / "checkpoints")
+    if path is not None:
+        require_data(path, read_state(path), data.training.data_sha256)
+
+
+def _evaluation(task: Task, data: PartData, accelerator: Accelerator) -> Evaluation:
+    """The same figures on every rank, and on any number of ranks."""
+    if not isinstance(task, SharedValidation):  # e.g. counts an object once however many batches show it
+        return task.evaluate(data.validation(accelerator.device))
+    rank, ranks = accelerator.process_index, accelerator.num_processes
+    measured = task.measure(data.validation(accelerator.device, rank, ranks))
+    numbers: dict[str, list[float]] = {}
+    for of_rank in gather_object([measured.numbers]):
+        for name, values in of_rank.items():
+            numbers.setdefault(name, []).extend(values)
+    return replace(measured, numbers=numbers).evaluation()  # pictures: those of the first rank are logged
+
+
+def _write_figures(path: Path, figures: dict[str, float]) -> None:
+    """JSON has no NaN and no infinity: null where nothing was there to measure."""
+    held = {name: value if math.isfinite(value) else None for name, value in figures.items()}
+    path.write_text(json.dumps(held, indent=2, allow_nan=False), encoding="utf-8")
+
+
+def _read_figures(path: Path) -> dict[str, float]:
+    held = json.loads(path.read_text(encoding="utf-8"))
+    return {name: math.nan if value is None else value for name, value in held.items()}
 
 
 def load_part(folder: Path, module: nn.Module, *, config_sha256: str) -> None:
-    """Averaged weights of a trained part. ModelError when it is missing or of another configuration."""
+    """Averaged weights of a trained part; needs no data. ModelError when it is missing or of another configuration."""
     path = latest_checkpoint(folder / "checkpoints")
     if path is None:
         raise ModelError(

@@ -24,6 +24,7 @@ from model.config import (
     as_yaml,
 )
 from model.data import ShardStream
+from model.encoders.cached import CachedEncoder
 from model.encoders.hand import HandEncoder, HandNet, save_hand_net
 from model.encoders.hand_training import HandTask
 from model.encoders.protocol import FeatureEncoder
@@ -39,7 +40,7 @@ from model.training.checkpoint import latest_checkpoint
 from model.training.facts import TrainingFacts, facts_of_run, load_facts
 from model.training.frozen_encoders import aggregator_over, given_hand_encoder, image_encoder, with_cache
 from model.training.identity import part_sha256
-from model.training.part_run import load_part, one_pass, part_data, run_part
+from model.training.part_run import load_part, one_pass, part_data, require_same_data, run_part
 from model.training.task import Task
 from model.training.trainer import StepReport
 from model.weights.weight_file import VAE, load_start, load_weights
@@ -65,10 +66,13 @@ def train_part(
 ) -> dict[str, float]:
     """Train one part (see PARTS) and give its figures on held-out cameras. Earlier parts must be trained.
 
-    Continues where it was stopped. ModelError when an earlier part is missing or of another configuration.
+    Continues where it was stopped. ModelError when an earlier part is missing, of another configuration or of
+    other data.
     """
     recipe = _recipe(name, config)
     data = part_data(config.data, config.validation, recipe, accelerator)
+    for earlier in trained_parts(config)[: trained_parts(config).index(name)]:
+        require_same_data(folder / earlier, data)
     task = _task(name, config, folder, accelerator.device)
     figures = run_part(
         task,
@@ -160,7 +164,14 @@ def _stage_one_task(
             latent_scale=facts.latent_scale,
         ),
         mean_shape=facts.mean_shape,
+        hand_net=_hand_net(hand),
     )
+
+
+def _hand_net(encoder: FeatureEncoder) -> HandNet | None:
+    """The network below a hand encoder, if it is ours."""
+    inner = encoder.encoder if isinstance(encoder, CachedEncoder) else encoder
+    return inner.network if isinstance(inner, HandEncoder) else None
 
 
 def _start(network: StageOne, part: StageOnePart) -> None:

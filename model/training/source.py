@@ -1,10 +1,11 @@
 """A ShardStream as the trainer wants it: from any point on, with places in the global batch."""
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 
 from model.data import ShardStream, StreamConfig, StreamState
 from model.motion_index import MotionIndex
+from model.training.identity import sha256_of
 from model.training.trainer import PlacedBatch
 
 __all__ = ["StreamSource"]
@@ -19,7 +20,13 @@ class StreamSource:
     rank: int
     ranks: int
 
-    def batches(self, epoch: int, samples_consumed: int) -> Iterator[PlacedBatch]:
+    @property
+    def data_sha256(self) -> str:
+        """Of all shards in their order, by what their records say of their files: the same wherever they lie."""
+        files = [shard.record.files for shard in self.index.shards]
+        return sha256_of(*(of_shard[name].sha256 for of_shard in files for name in sorted(of_shard)))
+
+    def batches(self, epoch: int, samples_consumed: int) -> Generator[PlacedBatch, None, None]:
         """Endless batches from there on. Loader processes end with the iterator."""
         state = StreamState(epoch=epoch, consumed=samples_consumed)
         stream = ShardStream(

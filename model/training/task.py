@@ -1,5 +1,6 @@
 """What can be trained: the trainer knows nothing of networks, a Task nothing of optimisers."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -11,7 +12,7 @@ from torch import nn
 
 from model.sample import Batch
 
-__all__ = ["Evaluation", "Losses", "Task"]
+__all__ = ["Evaluation", "Losses", "Measurements", "SharedValidation", "Task"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,10 +25,26 @@ class Losses:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Figures and pictures of a validation run. `better` names figures of which more is better."""
+    """Figures and pictures of a validation run. A figure that nothing was there for is NaN."""
 
     figures: dict[str, float]
     pictures: dict[str, UInt8[np.ndarray, "height width 3"]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Measurements:
+    """What was found on some of the validation batches: numbers whose means are the figures, pictures of the first."""
+
+    numbers: dict[str, list[float]]
+    pictures: dict[str, UInt8[np.ndarray, "height width 3"]]
+
+    def evaluation(self) -> Evaluation:
+        """The means, which do not depend on the order of the numbers."""
+        means = {
+            name: math.fsum(values) / len(values) if values else math.nan
+            for name, values in self.numbers.items()
+        }
+        return Evaluation(figures=means, pictures=self.pictures)
 
 
 @runtime_checkable
@@ -43,3 +60,11 @@ class Task(Protocol):
 
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """Figures with the weights that the module holds now; no gradients, randomness of its own fixed seed."""
+
+
+@runtime_checkable
+class SharedValidation(Protocol):
+    """A Task whose validation ranks share: each measures some batches, and the figures are means over all of them."""
+
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
+        """Numbers of every figure, which depend on their batch alone; as for `evaluate`, which gives their means."""

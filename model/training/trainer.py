@@ -5,8 +5,10 @@ so that a Task may call its networks as it likes. With equal global batches the 
 depend on the number of ranks but for the order of floating-point sums.
 """
 
+import math
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
@@ -19,7 +21,13 @@ from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
 from model.sample import Batch
-from model.training.checkpoint import TrainingState, latest_checkpoint, load_checkpoint, save_checkpoint
+from model.training.checkpoint import (
+    TrainingState,
+    delete_partial,
+    latest_checkpoint,
+    load_checkpoint,
+    save_checkpoint,
+)
 from model.training.clock import Clock
 from model.training.config import OptimizerConfig, TrainerConfig
 from model.training.draws import sample_generators
@@ -51,8 +59,12 @@ class PlacedBatch:
 class BatchSource(Protocol):
     """Batches from any point of the stream on, for ever."""
 
-    def batches(self, epoch: int, samples_consumed: int) -> Iterator[PlacedBatch]:
-        """Batches of this rank from there on; epochs follow each other."""
+    @property
+    def data_sha256(self) -> str:
+        """Digest of what is read: a run goes on with the same data only."""
+
+    def batches(self, epoch: int, samples_consumed: int) -> Generator[PlacedBatch, None, None]:
+        """Batches of this rank from there on; epochs follow each other. Closing it ends what loads them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,24 +111,46 @@ def train(
     """Train to the end, from the newest checkpoint in `folder` if there is one.
 
     `validate` is called with the averaged weights in place. Raises NonFiniteLossError, and
-    TrainingStopped after SIGTERM; both leave a checkpoint to go on from.
+    TrainingStopped after SIGTERM; both leave a checkpoint to go on from. However it ends, the log is
+    written and the loader processes are gone.
     """
     accelerator = accelerator or Accelerator()
     run = _prepare(task, config, optimizer_config, accelerator, folder)
-    state = TrainingState(
-        step=0, epoch=0, samples_consumed=0, config_yaml=config_yaml, config_sha256=config_sha256
+    begin = TrainingState(
+        step=0,
+        epoch=0,
+        samples_consumed=0,
+        config_yaml=config_yaml,
+        config_sha256=config_sha256,
+        data_sha256=source.data_sha256,
     )
-    newest = [latest_checkpoint(run.checkpoints)] if accelerator.is_main_process else [None]
+    try:
+        state = _newest_state(run, begin)
+        with _StopFlag() as stop, closing(source.batches(state.epoch, state.samples_consumed)) as batches:
+            return _loop(run, batches, state, validate, report, stop)
+    finally:
+        if run.writer is not None:
+            run.writer.close()
+
+
+def _newest_state(run: _Run, begin: TrainingState) -> TrainingState:
+    """That of the newest checkpoint, with everything restored from it, or `begin` where there is none."""
+    newest: list[Path | None] = [None]
+    if run.accelerator.is_main_process:
+        delete_partial(run.checkpoints)
+        newest = [latest_checkpoint(run.checkpoints)]
     broadcast_object_list(newest)
-    if newest[0] is not None:
-        state = load_checkpoint(
-            newest[0], task.module, run.average, run.optimizer, config_sha256=config_sha256
-        )
-    with _StopFlag() as stop:
-        state = _loop(run, source, state, validate, report, stop)
-    if run.writer is not None:
-        run.writer.close()
-    return state
+    if newest[0] is None:
+        return begin
+    state = load_checkpoint(
+        newest[0],
+        run.task.module,
+        run.average,
+        run.optimizer,
+        config_sha256=begin.config_sha256,
+        data_sha256=begin.data_sha256,
+    )
+    return replace(state, config_yaml=begin.config_yaml)  # the bookkeeping and the places of now
 
 
 def _prepare(
@@ -153,14 +187,13 @@ def _prepare(
 
 def _loop(
     run: _Run,
-    source: BatchSource,
+    batches: Iterator[PlacedBatch],
     state: TrainingState,
     validate: Callable[[], Evaluation] | None,
     report: Callable[[StepReport], None] | None,
     stop: "_StopFlag",
 ) -> TrainingState:
     config = run.config
-    batches = source.batches(state.epoch, state.samples_consumed)
     clock = Clock()
     saved_step = state.step
     while state.step < config.steps:
@@ -261,7 +294,8 @@ def _validate(run: _Run, step: int, validate: Callable[[], Evaluation]) -> None:
         run.average.swap(run.task.module)
     if run.writer is not None:
         for name, value in evaluation.figures.items():
-            run.writer.add_scalar(f"validation/{name}", value, step)
+            if math.isfinite(value):  # else nothing was there to measure
+                run.writer.add_scalar(f"validation/{name}", value, step)
         for name, picture in evaluation.pictures.items():
             run.writer.add_image(f"validation/{name}", picture, step, dataformats="HWC")
 

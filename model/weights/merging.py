@@ -1,69 +1,93 @@
-"""Adapters out of a run: merged into the weights that they adapt, or in peft's own format."""
+"""Adapters out of a run of either stage: merged into the weights that they adapt, or in peft's own format."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from model.config import TrainingConfig, parse_config
+from model.config import StageOnePart, TrainingConfig
 from model.errors import ModelError
 from model.networks.lora import LoraSettings, add_lora, export_adapter, merge_lora
+from model.slat_config import SlatFlowPart, SlatTrainingConfig, parse_any_config
 from model.sparse_structure.dual_branch import DualBranchFlow
-from model.sparse_structure.geometry_branch import GeometryBranch
+from model.structured_latent.flow import SlatFlow
 from model.training.checkpoint import latest_checkpoint, read_state
 from model.training.identity import part_sha256
+from model.training.slat_parts import slat_part_sha256
 from model.weights.safetensors_file import read_header, read_tensors
-from model.weights.weight_file import GEOMETRY, StartConfig, load_weights, write_weight_file
+from model.weights.slat import STAGE_TWO
+from model.weights.weight_file import StartConfig, load_weights, write_weight_file
 
 __all__ = ["export_run_adapter", "merge_run"]
 
+_STAGE_ONE, _SLAT_FLOW = "stage_one", "slat_flow"
+_FLOW = "flow."  # of the flow's tensors in checkpoints of both stages
 
-@dataclass(frozen=True, kw_only=True)
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Stage:
+    """What the stages differ in."""
+
+    part: StageOnePart | SlatFlowPart
+    sha256: Callable[[], str]  # of the part and the files that it stands on, as they are now
+    flow: nn.Module  # without weights
+    branch: str  # what of it is adapted: a submodule, "" for all of it
+    file_prefix: str  # of the names of checkpoints, in weight files
+
+    @property
+    def branch_prefix(self) -> str:
+        """Of the adapted tensors, in checkpoints."""
+        return f"{_FLOW}{self.branch}." if self.branch else _FLOW
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class _AdaptedRun:
-    """The newest checkpoint of a run of stage 1 with adapters."""
+    """The newest checkpoint of a run with adapters."""
 
     checkpoint: Path
-    config: TrainingConfig
+    stage: _Stage
     lora: LoraSettings
-    start: StartConfig
-    tensors: dict[str, Tensor]  # averaged; buffers and everything trained, names of StageOne
+    start: StartConfig | Path  # as the configuration has it
+    weights: Path  # of `start`
+    tensors: dict[str, Tensor]  # averaged; buffers and everything trained, names of the checkpoint
 
 
-def merge_run(run: Path, out: Path) -> StartConfig:
-    """Write the averaged weights of a run with its adapters merged, as a weight file; and how to start from it.
+def merge_run(run: Path, out: Path) -> StartConfig | Path:
+    """Write the averaged weights of a run with its adapters merged, as a weight file; and the `start` that names it.
 
     ModelError when the run has no adapters, or when the file that it started from is gone or another one.
     """
     adapted = _open(run)
-    with torch.device("meta"):
-        flow = DualBranchFlow(adapted.config.stage_one.network)
-    flow.to_empty(device="cpu")
-    load_weights(adapted.start.weights, flow.geometry, group=GEOMETRY)
-    add_lora(flow.geometry, adapted.lora)
-    of_flow = {n.removeprefix("flow."): t for n, t in adapted.tensors.items() if n.startswith("flow.")}
+    stage, flow = adapted.stage, adapted.stage.flow.to_empty(device="cpu")
+    branch = flow.get_submodule(stage.branch)
+    load_weights(adapted.weights, branch, group=stage.file_prefix + stage.branch_prefix)
+    add_lora(branch, adapted.lora)
+    of_flow = {n.removeprefix(_FLOW): t for n, t in adapted.tensors.items() if n.startswith(_FLOW)}
     left = flow.load_state_dict(of_flow, strict=False)
     trained = {name for name, parameter in flow.named_parameters() if parameter.requires_grad}
     if left.unexpected_keys or (absent := trained.intersection(left.missing_keys)):
         raise _unfit(adapted, sorted([*left.unexpected_keys, *absent])[0])
-    merge_lora(flow.geometry)
-    rest = {name: tensor for name, tensor in adapted.tensors.items() if not name.startswith("flow.")}
-    merged = {f"flow.{name}": tensor for name, tensor in flow.state_dict().items()} | rest
-    sources = {"checkpoint": str(adapted.checkpoint), "start": str(adapted.start.weights)}
-    write_weight_file(out, merged, sources=sources)
-    return StartConfig(weights=out, latent_scale=adapted.start.latent_scale)
+    merge_lora(branch)
+    rest = {name: tensor for name, tensor in adapted.tensors.items() if not name.startswith(_FLOW)}
+    merged = {_FLOW + name: tensor for name, tensor in flow.state_dict().items()} | rest
+    sources = {"checkpoint": str(adapted.checkpoint), "start": str(adapted.weights)}
+    write_weight_file(out, {stage.file_prefix + n: t for n, t in merged.items()}, sources=sources)
+    if isinstance(adapted.start, StartConfig):
+        return StartConfig(weights=out, latent_scale=adapted.start.latent_scale)
+    return out
 
 
 def export_run_adapter(run: Path, folder: Path) -> int:
-    """Write the averaged adapter of a run of stage 1 into `folder`, as peft does; the number of its parameters."""
+    """Write the averaged adapter of a run into `folder`, as peft does; the number of its parameters."""
     adapted = _open(run)
+    branch, prefix = adapted.stage.flow.get_submodule(adapted.stage.branch), adapted.stage.branch_prefix
     with torch.device("meta"):
-        branch = GeometryBranch(adapted.config.stage_one.network.geometry)
         add_lora(branch, adapted.lora)
     expected = {name for name, parameter in branch.named_parameters() if parameter.requires_grad}
-    held = {
-        name.removeprefix(GEOMETRY): t for name, t in adapted.tensors.items() if name.startswith(GEOMETRY)
-    }
+    held = {n.removeprefix(prefix): t for n, t in adapted.tensors.items() if n.startswith(prefix)}
     if absent := sorted(expected - held.keys()):
         raise _unfit(adapted, absent[0])
     adapter = {name: held[name] for name in sorted(expected)}
@@ -73,38 +97,61 @@ def export_run_adapter(run: Path, folder: Path) -> int:
 
 
 def _open(run: Path) -> _AdaptedRun:
-    path = latest_checkpoint(run / "stage_one" / "checkpoints")
-    if path is None:
+    found = {part: latest_checkpoint(run / part / "checkpoints") for part in (_STAGE_ONE, _SLAT_FLOW)}
+    checkpoints = {part: path for part, path in found.items() if path is not None}
+    if len(checkpoints) != 1:
         raise ModelError(
             run,
-            "holds no checkpoint of stage_one",
-            expected="the folder of a training run",
+            f"holds {'no' if not checkpoints else 'a'} checkpoint of {' and of '.join(found)}",
+            expected="the folder of a training run of one stage",
             action="Check the path.",
         )
+    ((part, path),) = checkpoints.items()
     state = read_state(path)
-    config = parse_config(state.config_yaml, where=f"{path / 'state.json'}: config_yaml")
-    lora, start = config.stage_one.lora, config.stage_one.start
+    stage = _stage(parse_any_config(state.config_yaml, where=f"{path / 'state.json'}: config_yaml"))
+    lora, start = stage.part.lora, stage.part.start
     if lora is None or start is None:
         raise ModelError(
             path,
             "was trained without adapters",
-            expected="a run with stage_one.lora",
+            expected=f"a run with {part}.lora",
             action="All its weights are in weights.safetensors and average.safetensors.",
         )
-    if part_sha256("stage_one", config) != state.config_sha256:
+    weights = start.weights if isinstance(start, StartConfig) else start
+    if stage.sha256() != state.config_sha256:
         raise ModelError(
             path,
-            f"started from other weights than those that are in {start.weights} now",
+            f"started from other weights than those that are in {weights} now",
             expected="the file that the run started from",
             action="Put it back.",
         )
     return _AdaptedRun(
         checkpoint=path,
-        config=config,
+        stage=stage,
         lora=lora,
         start=start,
+        weights=weights,
         tensors=_averaged(path),
     )
+
+
+def _stage(config: TrainingConfig | SlatTrainingConfig) -> _Stage:
+    with torch.device("meta"):
+        if isinstance(config, TrainingConfig):
+            return _Stage(
+                part=config.stage_one,
+                sha256=partial(part_sha256, _STAGE_ONE, config),
+                flow=DualBranchFlow(config.stage_one.network),
+                branch="geometry",
+                file_prefix="",
+            )
+        return _Stage(
+            part=config.slat_flow,
+            sha256=partial(slat_part_sha256, _SLAT_FLOW, config),
+            flow=SlatFlow(config.slat_flow.network),
+            branch="",
+            file_prefix=STAGE_TWO,
+        )
 
 
 def _averaged(checkpoint: Path) -> dict[str, Tensor]:
@@ -122,6 +169,6 @@ def _unfit(adapted: _AdaptedRun, first: str) -> ModelError:
     return ModelError(
         adapted.checkpoint,
         f"does not fit its own configuration, first {first}",
-        expected="the adapters and new modules of stage 1",
+        expected="the adapters and new modules of its stage",
         action="Use the version of this package that wrote it.",
     )

@@ -34,7 +34,9 @@ __all__ = [
     "GAUSSIANS",
     "SLAT_ENCODER",
     "SLAT_FLOW",
+    "STAGE_TWO",
     "SURFACE",
+    "load_slat_vae",
     "load_stage_two_start",
     "slat_networks",
     "trellis_normalisation",
@@ -138,6 +140,12 @@ def load_stage_two_start(path: Path, network: ViewConditionedSlatFlow) -> None:
     if any(name.startswith(tuple(rest)) for name in shapes):
         for group, module in rest.items():
             load_weights(path, module, group=group)
+
+
+def load_slat_vae(path: Path, encoder: SlatEncoder, surface: SurfaceDecoder) -> None:
+    """Both halves of the SLat VAE. ModelError when one is missing from the file or does not fit."""
+    load_weights(path, encoder, group=SLAT_ENCODER)
+    load_weights(path, surface, group=SURFACE)
 
 
 def _flow_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -76,6 +76,16 @@ def test_stage_one_without_its_parts_says_what_to_train(dataset, tmp_path):
     assert "holds no checkpoint; expected the trained vae. Train it first: forehoi train vae." in text
 
 
+def test_the_folder_of_a_run_is_named_after_the_file_as_the_help_says(dataset, tmp_path, monkeypatch):
+    text = CliRunner().invoke(main, ["train", "--help"]).output
+    assert "runs/NAME for a configuration NAME.yaml" in " ".join(text.split())
+    settings = small_settings(dataset)
+    assert settings["name"] == "tiny"
+    config = write_config(tmp_path / "mine.yaml", settings)
+    monkeypatch.chdir(tmp_path)
+    assert "runs/mine/vae: holds no checkpoint" in fails("train", "stage_one", "--config", config)
+
+
 def test_a_checkpoint_of_another_configuration(finished, tmp_path):
     """Of the part itself, and of one that it stands on."""
     config, out = finished

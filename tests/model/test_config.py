@@ -123,6 +123,16 @@ def test_what_cannot_train_or_measure_is_refused(old, new, expected):
         parse_config(text.replace(old, new), where="tiny")
 
 
+@pytest.mark.parametrize(("name", "grid"), [("tiny", 16), ("paper", 37)])
+def test_mask_tokens_lie_on_the_tokens_of_any_image_encoder(name, grid):
+    config = loaded(name)
+    network = config.stage_one.network
+    assert network.masks.grid == config.encoders.image.grid == grid
+    other = replace(network, masks=replace(network.masks, grid=grid - 1))
+    with pytest.raises(ValueError, match=f"masks.grid is {grid - 1} and the grid of encoders.image {grid}:"):
+        replace(config, stage_one=replace(config.stage_one, network=other))
+
+
 def test_guidance_needs_a_dropped_condition_and_adapters_no_dropout():
     part = loaded("paper").stage_one
     with pytest.raises(ValueError, match="drop_condition > 0"):

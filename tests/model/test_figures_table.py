@@ -1,5 +1,7 @@
 """The table shows a figure beside what it has to beat, and only there."""
 
+import math
+
 from rich.console import Console
 
 from model.figures_table import figures_table
@@ -8,7 +10,16 @@ from model.figures_table import figures_table
 def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
     figures = {
         "vae": {"voxel_iou": 0.7},
-        "stage_one": {"voxel_iou": 0.66, "mean_shape_iou": 0.32, "mask_iou": 0.71, "visible_iou": 0.87},
+        "stage_one": {
+            "voxel_iou": 0.66,
+            "mean_shape_iou": 0.32,
+            "mask_iou": 0.71,
+            "visible_iou": 0.87,
+            "found_visible_iou": 0.68,
+            "occluded_mask_iou": 0.5,
+            "occluded_visible_iou": 0.4,
+            "occluded_found_visible_iou": math.nan,
+        },
     }
     console = Console(width=120)
     with console.capture() as capture:
@@ -21,7 +32,14 @@ def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
     (shape,) = [line for line in lines if "0.660" in line]
     assert "0.320" in shape
     assert "mean training shape" in shape
-    assert any("0.710" in line and "0.870" in line and "true visible mask" in line for line in lines)
+    (found,) = [index for index, line in enumerate(lines) if "0.710" in line]
+    assert "0.680" in lines[found]
+    assert "as the hand encoder finds it" in lines[found]
+    assert "0.870" in lines[found + 1]
+    assert "the true one" in lines[found + 1]
+    (occluded,) = [line for line in lines if "0.500" in line]
+    assert "0.400" in occluded  # what was not measured has no row
+    assert "nan" not in capture.get()
 
 
 def test_stage_two_has_the_mean_latent_to_beat() -> None:

@@ -9,7 +9,7 @@ from model.crop import Augmentation
 from model.data import ShardStream
 from model.sample import Batch
 from model.stream_config import StreamConfig
-from shards.schema import FrameRow
+from shards.schema import FrameRow, ObjectRow
 from shards.splits import Split, SplitRule, split_of_object
 from shards.writer import begin_dataset, commit_shard, stage_motion
 from tests.shards.synthetic import (
@@ -69,6 +69,7 @@ def write_balls(
     size_px: int = 40,
     rule: SplitRule = SPLIT_RULE,
     change_frame: Callable[[FrameRow], FrameRow] = lambda frame: frame,
+    change_object: Callable[[ObjectRow], ObjectRow] = lambda row: row,
 ) -> Path:
     """One shard per entry of `splits`, one motion per split in it, each with an object of its own."""
     begin_dataset(root, replace(dataset_record(), split_rule=rule))
@@ -79,7 +80,8 @@ def write_balls(
         for split in motion_splits:
             uid = uid_of_split(split, used[split], rule)
             used[split] += 1
-            _stage(root, shard, motion, uid, split, cameras, n_frames, size_px, change_frame)
+            row = change_object(replace(synthetic_object(motion), object_uid=uid))
+            _stage(root, shard, motion, row, split, cameras, n_frames, size_px, change_frame)
             motion += 1
         commit_shard(root, shard, motion_indices=range(first, motion), provenance=PROVENANCE)
     return root
@@ -89,14 +91,13 @@ def _stage(
     root: Path,
     shard: int,
     motion: int,
-    uid: str,
+    object_row: ObjectRow,
     split: Split,
     cameras: int,
     n_frames: int,
     size_px: int,
     change_frame: Callable[[FrameRow], FrameRow],
 ) -> None:
-    object_row = replace(synthetic_object(motion), object_uid=uid)
     clips, frames = [], []
     for camera in range(cameras):
         clip, clip_frames = synthetic_clip(object_row, motion, camera, n_frames, size_px)

@@ -55,6 +55,9 @@ def test_loader_processes_send_the_same_surfaces(balls):
         for name in ("points", "normals", "colors", "sdf_points", "sdf_values"):
             assert torch.equal(getattr(a.true_surface, name), getattr(b.true_surface, name))
         assert a.true_surface.object_uids == b.true_surface.object_uids
+        assert a.true_surface.are_mirrored == b.true_surface.are_mirrored
+    seen = {flag for batch in there for flag in batch.true_surface.are_mirrored}
+    assert seen == {False, True}
 
 
 @pytest.mark.parametrize("position", range(4))
@@ -80,3 +83,4 @@ def test_a_mirrored_sample_keeps_every_distance(balls, position):
         np.testing.assert_allclose(a, b, atol=1e-5)
     np.testing.assert_array_equal(other.surface.sdf_values, sample.surface.sdf_values)
     np.testing.assert_array_equal(other.surface.points[:, 0], -sample.surface.points[:, 0])
+    assert (sample.surface.is_mirrored, other.surface.is_mirrored, again.surface.is_mirrored) == (0, 1, 0)

@@ -1,5 +1,7 @@
 """Hand and image features joined, patch by patch."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -76,7 +78,15 @@ def test_shifting_both_features_shifts_the_tokens() -> None:
     torch.testing.assert_close(shifted[:, 8:12], plain[:, 6:10])
 
 
-def test_bfloat16() -> None:
-    aggregator = FeatureAggregator(SMALL).bfloat16()
-    tokens = aggregator(torch.randn(1, 1, 256, 6).bfloat16(), torch.randn(1, 1, 64, 5).bfloat16())
-    assert tokens.dtype == torch.bfloat16
+@pytest.mark.parametrize("hand_grid", [8, 16, 24])
+def test_bfloat16_of_a_coarser_an_equal_and_a_finer_hand_grid(hand_grid: int) -> None:
+    torch.manual_seed(0)
+    aggregator = FeatureAggregator(replace(SMALL, hand_grid=hand_grid))
+    image, hand = torch.randn(1, 1, 256, 6), torch.randn(1, 1, hand_grid**2, 5)
+    exact = aggregator(image, hand)
+    with torch.autocast("cpu", torch.bfloat16):
+        mixed = aggregator(image, hand)
+    half = aggregator.bfloat16()(image.bfloat16(), hand.bfloat16())
+    assert mixed.dtype == half.dtype == torch.bfloat16
+    for tokens in (mixed, half):
+        torch.testing.assert_close(tokens.float(), exact, rtol=0, atol=0.02)

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 
+import pytest
 import torch
 
 from model.encoders.cached import CachedEncoder
@@ -56,3 +57,25 @@ def test_moving_forgets() -> None:
     cached.to("cpu", torch.float32)(images)
     assert inner.asked == [1, 1]
     assert cached(images.bfloat16()).dtype == torch.bfloat16
+
+
+@dataclass(frozen=True, kw_only=True)
+class Weighted(Means):
+    """Has weights, as every encoder does: autocast would change the type that it computes in."""
+
+    layer: torch.nn.Linear = field(default_factory=lambda: torch.nn.Linear(3, 3).requires_grad_(False))
+
+    def __call__(self, images: torch.Tensor) -> torch.Tensor:
+        return self.layer(super().__call__(images))
+
+
+@pytest.mark.parametrize("autocast_first", [True, False])
+def test_features_do_not_depend_on_who_asked_first(autocast_first: bool) -> None:
+    inner = Weighted()
+    cached = CachedEncoder(encoder=inner, max_views=1)  # one kept, one computed each time
+    images = torch.rand(1, 2, 3, 8, 8)
+    for autocast in (autocast_first, not autocast_first):
+        with torch.autocast("cpu", torch.bfloat16, enabled=autocast):
+            tokens = cached(images)
+        assert tokens.dtype == torch.float32
+        assert torch.equal(tokens, inner(images))

@@ -111,6 +111,15 @@ def test_another_network_is_refused(tmp_path: Path) -> None:
         loaded(tmp_path, 518)
 
 
+def test_other_patches_are_refused(tmp_path: Path) -> None:
+    config = Dinov2WithRegistersConfig(
+        hidden_size=16, num_hidden_layers=1, num_attention_heads=2, image_size=64, patch_size=16
+    )
+    Dinov2WithRegistersModel(config).save_pretrained(tmp_path)
+    with pytest.raises(ModelError, match="its patches are 16 px wide and not 14"):
+        loaded(tmp_path, 518)
+
+
 def test_missing_weights_are_refused(folder: Path, tmp_path: Path) -> None:
     network = Dinov2WithRegistersModel.from_pretrained(folder)
     state = {name: value for name, value in network.state_dict().items() if "layer.1.mlp.fc1" not in name}
@@ -120,6 +129,6 @@ def test_missing_weights_are_refused(folder: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("image_size", [0, 520])
-def test_a_size_that_patches_do_not_divide(folder: Path, image_size: int) -> None:
+def test_a_size_that_patches_do_not_divide_is_refused_before_anything_is_loaded(image_size: int) -> None:
     with pytest.raises(ModelError, match="multiple of the patch size 14"):
-        loaded(folder, image_size)
+        DinoConfig(source="/nowhere", image_size=image_size, local_files_only=True)

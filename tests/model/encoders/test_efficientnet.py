@@ -37,7 +37,7 @@ def photograph(name: str) -> torch.Tensor:
 
 @pytest.mark.parametrize("name", IMAGENET)
 def test_the_weights_recognise_photographs(name: str) -> None:
-    network = load_efficientnet(EfficientNetConfig(image_size=224, grid=16)).network
+    network = load_efficientnet(EfficientNetConfig(image_size=224, grid=16)).pyramid.network
     with torch.no_grad():
         ours = network((255 * photograph(name) - 127) / 128).softmax(-1)[0]
     found = ours.topk(3)
@@ -48,7 +48,7 @@ def test_the_weights_recognise_photographs(name: str) -> None:
 
 @pytest.mark.parametrize("name", IMAGENET)
 def test_the_tensorflow_normalisation_is_surer_than_that_of_the_packages_readme(name: str) -> None:
-    network = load_efficientnet(EfficientNetConfig(image_size=224, grid=16)).network
+    network = load_efficientnet(EfficientNetConfig(image_size=224, grid=16)).pyramid.network
     picture = photograph(name)
     mean, std = (torch.tensor(x).reshape(3, 1, 1) for x in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
     classes = sorted(IMAGENET[name])
@@ -59,7 +59,7 @@ def test_the_tensorflow_normalisation_is_surer_than_that_of_the_packages_readme(
 
 
 def test_the_weights_are_the_published_ones(encoder: EfficientNetEncoder) -> None:
-    stem = encoder.network._conv_stem.weight.contiguous().numpy()
+    stem = encoder.pyramid.network._conv_stem.weight.contiguous().numpy()
     assert hashlib.sha256(stem.astype("<f4").tobytes()).hexdigest() == (
         "8ba97205755881fe71b6c14e8e59112d4ab77894047ba6aeffe234055f03eba3"
     )
@@ -83,8 +83,8 @@ def test_deterministic_and_views_do_not_mix(encoder: EfficientNetEncoder) -> Non
 def test_frozen(encoder: EfficientNetEncoder) -> None:
     images = torch.rand(1, 1, 3, 128, 128, requires_grad=True)
     assert not encoder(images).requires_grad
-    assert not any(p.requires_grad for p in encoder.network.parameters())
-    assert not any(module.training for module in encoder.network.modules())
+    assert not any(p.requires_grad for p in encoder.pyramid.network.parameters())
+    assert not any(module.training for module in encoder.pyramid.network.modules())
 
 
 @pytest.mark.parametrize("channels", [slice(0, 96), slice(96, 136), slice(136, 248), slice(248, 568)])

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import safe_open
 from torch.nn import functional
 
 from model.encoders.hand import HandEncoder, HandNet, HandNetConfig, HandOutput, load_hand_net, save_hand_net
@@ -16,7 +17,7 @@ from model.sample import Batch
 from model.training.task import Task
 from tests.model.encoders.drawn import blob_picture, hand_batch
 
-SMALL = HandNetConfig(image_size=64, widths=(8, 16, 16, 32), decoder=16)
+SMALL = HandNetConfig(image_size=64, stem=(8, 16), decoder=16)
 LOSS = HandLossConfig(object_weight=1.0, joint_weight=1.0, side_weight=0.1, sigma_cells=1.0, color_jitter=0.0)
 
 
@@ -58,8 +59,23 @@ class Oracle(HandNet):
 
 
 def test_the_recommended_network_is_small() -> None:
-    config = HandNetConfig(image_size=128, widths=(16, 32, 64, 128), decoder=48)
-    assert sum(p.numel() for p in HandNet(config).parameters()) < 1_000_000
+    network = HandNet(HandNetConfig(image_size=128, stem=(16, 32), decoder=64))
+    assert sum(p.numel() for p in network.parameters() if p.requires_grad) < 300_000
+
+
+def test_only_the_decoder_is_trained_and_saved(tmp_path: Path) -> None:
+    net = network().train()
+    before = {name: value.clone() for name, value in net.backbone.state_dict().items()}
+    batch = hand_batch(2, 1, 64, seed=6)
+    optimizer = torch.optim.SGD([p for p in net.parameters() if p.requires_grad], lr=0.1)
+    HandTask(network=net, config=LOSS).loss(batch, []).total.backward()
+    optimizer.step()
+    for name, value in net.backbone.state_dict().items():  # the batch norms' statistics among them
+        assert torch.equal(value, before[name]), name
+    assert all(p.grad is not None for p in net.parameters() if p.requires_grad)
+    save_hand_net(net, tmp_path, dtype=torch.float32)
+    with safe_open(tmp_path / "hand_encoder.safetensors", "pt") as stored:
+        assert set(stored.keys()) == {n for n in net.state_dict() if not n.startswith("backbone.")}
 
 
 def test_tokens_shape_protocol_and_frozenness(tmp_path: Path) -> None:
@@ -68,7 +84,7 @@ def test_tokens_shape_protocol_and_frozenness(tmp_path: Path) -> None:
     assert isinstance(encoder, FeatureEncoder)
     images = torch.rand(2, 3, 3, 96, 96, requires_grad=True)
     tokens = encoder(images)
-    assert tokens.shape == (2, 3, 64, encoder.channels) == (2, 3, 64, 4 * 16 + 32)
+    assert tokens.shape == (2, 3, 64, encoder.channels) == (2, 3, 64, 4 * 16 + 16)
     assert not tokens.requires_grad
     assert not any(p.requires_grad for p in encoder.network.parameters())
     assert torch.equal(tokens, encoder(images))
@@ -77,10 +93,17 @@ def test_tokens_shape_protocol_and_frozenness(tmp_path: Path) -> None:
     assert functional.cosine_similarity(half.float(), tokens, dim=-1).mean() > 0.98
 
 
+def without_pyramid(net: HandNet) -> HandNet:
+    """Its own layers alone: where the pyramid's maps look is tested with it."""
+    for lateral in (net.lateral_4, net.lateral_8, net.lateral_16, net.lateral_32):
+        torch.nn.init.zeros_(lateral.weight)
+    return net
+
+
 @torch.no_grad()
 def test_the_layout_does_not_look_aside() -> None:
     """With all kernels mirrored, a mirrored picture has mirrored features: only for centred cells."""
-    plain, mirrored = network(), network()
+    plain, mirrored = without_pyramid(network()), without_pyramid(network())
     for module in mirrored.modules():
         if isinstance(module, torch.nn.Conv2d):
             module.weight.copy_(module.weight.flip(-1))
@@ -96,7 +119,9 @@ def test_a_spot_changes_the_tokens_over_it_most() -> None:
     with_spot = blob_picture(64, (column + 0.5) / 16, (row + 0.5) / 16, 0.02)
     change = torch.zeros(256)
     for seed in range(8):
-        tokens = network(seed).features(torch.stack([torch.full_like(with_spot, 0.5), with_spot]), 16)
+        tokens = without_pyramid(network(seed)).features(
+            torch.stack([torch.full_like(with_spot, 0.5), with_spot]), 16
+        )
         change += (tokens[1] - tokens[0])[:, : SMALL.decoder].norm(dim=-1)
     found_row, found_column = divmod(int(change.argmax()), 16)
     assert abs(found_row - row) <= 1
@@ -137,8 +162,8 @@ def test_missing_weights_name_the_command(tmp_path: Path) -> None:
         ("hand_encoder.safetensors", b"\x00\x01"),
         ("hand_encoder.json", b"{"),
         ("hand_encoder.json", b'{"image_size": 64}'),
-        ("hand_encoder.json", b'{"image_size": 64, "widths": [8, 16, 16, 40], "decoder": 16}'),
-        ("hand_encoder.json", b'{"image_size": 60, "widths": [8, 16, 16, 32], "decoder": 16}'),
+        ("hand_encoder.json", b'{"image_size": 64, "stem": [8, 24], "decoder": 16}'),
+        ("hand_encoder.json", b'{"image_size": 48, "stem": [8, 16], "decoder": 16}'),
     ],
 )
 def test_broken_files_are_one_clear_line(tmp_path: Path, name: str, content: bytes) -> None:
@@ -230,15 +255,15 @@ def _one_thread() -> Iterator[None]:
 @pytest.mark.usefixtures("_one_thread")
 def test_it_learns_masks_and_joints() -> None:
     torch.manual_seed(0)
-    net = HandNet(HandNetConfig(image_size=48, widths=(8, 16, 16, 16), decoder=16))
+    net = HandNet(HandNetConfig(image_size=64, stem=(8, 16), decoder=16))
     task = HandTask(network=net, config=LOSS)
     optimizer = torch.optim.AdamW(task.module.parameters(), lr=5e-3)
     for step in range(120):
-        losses = task.loss(hand_batch(8, 1, 48, seed=100 + step), [])
+        losses = task.loss(hand_batch(8, 1, 64, seed=100 + step), [])
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
-    figures = task.evaluate([hand_batch(16, 2, 48, seed=9)]).figures
+    figures = task.evaluate([hand_batch(16, 2, 64, seed=9)]).figures
     assert figures["hand_mask_iou"] > 0.85, figures
     assert figures["hand_pck5"] > 0.5, figures
     assert figures["hand_side_accuracy"] > 0.9, figures

@@ -24,7 +24,16 @@ def test_chamfer_of_single_voxels_is_their_distance_in_cube_sides():
     a[2, 3, 4] = b[2, 3, 12] = True
     assert voxel_chamfer(a, b) == pytest.approx(0.5)
     assert voxel_chamfer(a, a) == 0.0
-    assert voxel_chamfer(a, torch.zeros_like(a)) == float("inf")
+
+
+def test_nothing_found_is_as_far_as_two_shapes_in_the_cube_can_be():
+    """Finite, and never better than any guess."""
+    a, nothing = torch.zeros(16, 16, 16, dtype=torch.bool), torch.zeros(16, 16, 16, dtype=torch.bool)
+    a[0, 0, 0] = True
+    farthest = a.flip((0, 1, 2))
+    assert voxel_chamfer(a, nothing) == voxel_chamfer(nothing, a) == pytest.approx(3**0.5)
+    assert voxel_chamfer(a, farthest) < voxel_chamfer(a, nothing)
+    assert voxel_chamfer(nothing, nothing) == 0.0
 
 
 def test_the_mean_shape_is_the_best_cut_through_the_mean() -> None:

@@ -66,7 +66,7 @@ def test_first_squares_are_centred_or_given():
 
 def test_hand_regions_hold_the_joints_of_hands_that_are_seen():
     torch.manual_seed(0)
-    network = HandNet(HandNetConfig(image_size=64, widths=(8, 8, 8, 8), decoder=8)).eval()
+    network = HandNet(HandNetConfig(image_size=64, stem=(8, 8), decoder=8)).eval()
     images = torch.rand(2, 3, SIZE, SIZE)
     with torch.no_grad():
         network.maps.bias[0] = 50.0

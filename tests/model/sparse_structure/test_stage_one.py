@@ -1,11 +1,13 @@
 """The stage-1 task on small sizes: losses reach every trained part, prediction is repeatable, targets are exact."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
+from model.encoders.hand import HandNet, HandNetConfig
 from model.flow import Guidance, SamplerSettings, UniformTime
 from model.sample import Batch
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
@@ -60,6 +62,7 @@ def task() -> StageOneTask:
             latent_scale=1.0,
         ),
         mean_shape=torch.zeros(64, 64, 64, dtype=torch.bool),
+        hand_net=None,
     )
 
 
@@ -126,6 +129,41 @@ def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
     assert math.isnan(task.evaluate([batch]).figures["occluded_mask_iou"])
     assert 0.0 <= evaluation.figures["mask_iou"] <= 1.0
     assert evaluation.pictures["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
+
+
+def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(task, batch):
+    assert math.isnan(task.evaluate([batch]).figures["found_visible_iou"])  # no network of ours
+    network = HandNet(HandNetConfig(image_size=32, stem=(8, 8), decoder=8)).eval()
+    for bias, expected in ((50.0, float(batch.object_amodal.float().mean())), (-50.0, 0.0)):
+        with torch.no_grad():  # the object everywhere, then nowhere
+            network.maps.weight[1] = 0.0
+            network.maps.bias[1] = bias
+        figures = replace(task, hand_net=network).evaluate([batch]).figures
+        assert figures["found_visible_iou"] == pytest.approx(expected)
+        assert figures["occluded_found_visible_iou"] == pytest.approx(expected)
+
+
+def test_an_empty_prediction_is_counted_and_its_distance_is_finite(task, batch):
+    """A decoder that fills nothing, as that of a young network may."""
+    with torch.no_grad():
+        bias = task.vae.decoder.out_layer[2].bias
+        bias += 100 - bias.min()
+        full = task.evaluate([batch]).figures
+        bias -= 1000
+        figures = task.evaluate([batch]).figures
+    assert (full["empty"], figures["empty"]) == (0.0, 1.0)
+    assert full["chamfer"] < figures["chamfer"] == pytest.approx(math.sqrt(3))
+    assert figures["voxel_iou"] == 0.0
+
+
+def test_what_is_measured_on_a_batch_does_not_depend_on_the_batches_before_it(task, batch):
+    """So ranks may share them."""
+    first, second = one(batch, 0), one(batch, 1)
+    together = task.measure([first, second]).numbers
+    apart = [task.measure([part]).numbers for part in (second, first)]
+    assert together == {name: apart[1][name] + apart[0][name] for name in FIGURES}
+    assert together["chamfer"][0] != together["chamfer"][1]
+    assert task.evaluate([second, first]).figures == task.evaluate([first, second]).figures
 
 
 def test_mask_targets_are_plus_one_where_more_than_half_is_covered(batch):

@@ -18,6 +18,7 @@ from model.structured_latent.features import (
     object_features,
     projected_features,
 )
+from model.structured_latent.object_views import ObjectView
 from model.surface.fields import CORNERS
 from tests.model.structured_latent.solids import ball, ball_distance, plate, plate_distance, shell
 
@@ -106,36 +107,49 @@ class PictureItself:
         return images.flatten(3).transpose(2, 3)
 
 
+def view(image: np.ndarray, T_cam_from_canonical: np.ndarray) -> ObjectView:
+    """By a camera of 48 pixels."""
+    K = np.array([[60.0, 0, 24], [0, 60, 24], [0, 0, 1]])
+    return ObjectView(image=image, K=K, T_cam_from_canonical=T_cam_from_canonical)
+
+
 def test_projected_features_are_what_is_at_the_projections():
     """Pictures that show their own pixel coordinates: the features are the mean projection of the voxel."""
     size, rng = 48, np.random.default_rng(0)
-    voxels = torch.from_numpy(rng.integers(0, 64, (50, 3)))
-    pixel = (torch.arange(size) + 0.5) / size
-    image = torch.stack([pixel.expand(size, size), pixel[:, None].expand(size, size), torch.ones(size, size)])
-    K = torch.tensor([[60.0, 0, 24], [0, 60, 24], [0, 0, 1]]).expand(2, 3, 3)
-    T = torch.eye(4).repeat(2, 1, 1)
-    T[0, :3, 3] = torch.tensor([0.0, 0, 2.5])
-    T[1, :3, :3] = 0.5 * torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-    T[1, :3, 3] = torch.tensor([0.1, 0, 2])
-    found = projected_features(image.expand(2, 3, size, size), K, T, voxels, 64, PictureItself(size))
+    voxels = rng.integers(0, 64, (50, 3))
+    column, row = np.meshgrid(np.arange(size), np.arange(size))
+    image = np.stack([5 * column, 5 * row, np.full_like(row, 255)], axis=-1).astype(np.uint8)
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[0, :3, 3] = [0.0, 0, 2.5]
+    T[1, :3, :3] = 0.5 * np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    T[1, :3, 3] = [0.1, 0, 2]
+    views = [view(image, t) for t in T]
+    found = projected_features(iter(views), torch.from_numpy(voxels), 64, PictureItself(size))
     centers = (voxels + 0.5) / 64 - 0.5
-    expected = []
-    for k, t in zip(K, T):
-        cam = centers @ t[:3, :3].T + t[:3, 3]
-        uvw = cam @ k.T
-        expected.append(uvw[:, :2] / uvw[:, 2:] / size)
-    torch.testing.assert_close(
-        found.features[:, :2], torch.stack(expected).mean(0).float(), atol=1e-5, rtol=0
-    )
+    expected = np.zeros((50, 2))
+    for shown in views:
+        cam = centers @ shown.T_cam_from_canonical[:3, :3].T + shown.T_cam_from_canonical[:3, 3]
+        uvw = cam @ shown.K.T
+        expected += 5 * (uvw[:, :2] / uvw[:, 2:] - 0.5) / 255 / 2  # pixel i is centred at i + 1/2
+    np.testing.assert_allclose(found.features[:, :2], expected, atol=1e-5)
     assert (found.views == 2).all()
 
 
 def test_a_voxel_behind_the_camera_or_beside_the_picture_is_seen_by_no_view():
-    K = torch.tensor([[[60.0, 0, 24], [0, 60, 24], [0, 0, 1]]])
-    T = torch.eye(4)[None].clone()
-    T[0, 2, 3] = 0.1  # the camera is inside the cube
+    T = np.eye(4)
+    T[2, 3] = 0.1  # the camera is inside the cube
     voxels = torch.tensor([[32, 32, 0], [32, 32, 63], [63, 32, 32]])
-    found = projected_features(torch.ones(1, 3, 48, 48), K, T, voxels, 64, PictureItself(48))
+    white = np.full((48, 48, 3), 255, np.uint8)
+    found = projected_features([view(white, T)], voxels, 64, PictureItself(48))
     assert found.views.tolist() == [0, 1, 0]
     assert (found.features[0] == 0).all()
     assert (found.features[1] == 1).all()
+
+
+def test_more_views_than_are_encoded_at_once_are_all_counted():
+    T = np.eye(4)
+    T[2, 3] = 2.0
+    views = [view(np.full((48, 48, 3), value, np.uint8), T) for value in range(0, 190, 10)]
+    found = projected_features(views, torch.tensor([[32, 32, 32]]), 64, PictureItself(48))
+    assert found.views.tolist() == [19]
+    torch.testing.assert_close(found.features, torch.full((1, 3), 90 / 255))

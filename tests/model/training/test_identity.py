@@ -32,7 +32,14 @@ def test_loading_and_bookkeeping_do_not_decide(name):
     assert part_sha256(name, with_trainer(config, log_every=3, checkpoint_every=7)) == expected
 
 
-@pytest.mark.parametrize("change", [{"seed": 1}, {"held_out_cameras": 0.5}, {"datasets": ("elsewhere",)}])
+def test_where_the_data_lie_does_not_decide():
+    """What is in them does: see test_moved_data.py."""
+    config = tiny()
+    moved = replace(config, data=replace(config.data, datasets=("elsewhere", "s3://bucket/more")))
+    assert part_sha256("stage_one", moved) == part_sha256("stage_one", config)
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"held_out_cameras": 0.5}, {"split": "val"}])
 def test_what_is_drawn_from_the_data_decides(change):
     config = tiny()
     other = replace(config, data=replace(config.data, **change))

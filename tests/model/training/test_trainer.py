@@ -1,10 +1,12 @@
 """Training resumes exactly, is the same on any number of ranks, and stops with a reason."""
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -12,18 +14,28 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from model.errors import ModelError
 from model.training.checkpoint import latest_checkpoint, load_average, read_state
 from model.training.config import TrainerConfig
-from model.training.trainer import NonFiniteLossError, StepReport, train
+from model.training.task import Evaluation
+from model.training.trainer import NonFiniteLossError, StepReport, TrainingStopped, train
 from tests.model.training.toy import OPTIMIZER, ToySource, ToyTask, settings
 
 ROOT = Path(__file__).resolve().parents[3]
 TOY = Path(__file__).with_name("toy.py")
 
 
-def run(folder: Path, config: TrainerConfig, *, source: ToySource | None = None, sha: str = "toy", **options):
+def run(
+    folder: Path,
+    config: TrainerConfig,
+    *,
+    source: ToySource | None = None,
+    sha: str = "toy",
+    yaml: str = "toy",
+    **options,
+):
     task = ToyTask()
     source = source or ToySource(4)
     state = train(
@@ -32,7 +44,7 @@ def run(folder: Path, config: TrainerConfig, *, source: ToySource | None = None,
         config,
         OPTIMIZER,
         folder=folder,
-        config_yaml="toy",
+        config_yaml=yaml,
         config_sha256=sha,
         **options,
     )
@@ -220,6 +232,18 @@ def test_another_configuration_is_refused(tmp_path):
         run(tmp_path, settings(8), sha="other")
 
 
+def test_other_data_are_refused_and_a_run_that_goes_on_keeps_the_configuration_of_now(tmp_path):
+    """The text holds bookkeeping and places, which may change; what decides is in its digest."""
+    run(tmp_path, settings(4), yaml="before")
+    with pytest.raises(
+        ModelError, match=r"step-00000004: was trained on other data \(colours\).*wherever they"
+    ):
+        run(tmp_path, settings(8), source=ToySource(4, data_sha256="greys"))
+    run(tmp_path, settings(8), yaml="after")
+    state = read_state(latest_checkpoint(tmp_path / "checkpoints"))
+    assert (state.step, state.config_yaml, state.data_sha256) == (8, "after", "colours")
+
+
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
@@ -248,6 +272,52 @@ def test_a_half_written_checkpoint_does_not_count(tmp_path):
     (folder / "notes").mkdir()
     assert latest_checkpoint(folder).name == "step-00000008"
     assert sorted(p.name for p in folder.glob("step-*")) == ["step-00000004", "step-00000008"]
+
+
+def test_what_a_killed_process_left_half_written_is_deleted_and_nothing_else(tmp_path):
+    folder = tmp_path / "checkpoints"
+    others = [folder / "notes", folder / ".step-1.partial", tmp_path / ".step-00000099.partial"]
+    for steps in (4, 8):  # a run that begins, a run that goes on
+        for path in (folder / ".step-00000099.partial", *others):
+            path.mkdir(parents=True, exist_ok=True)
+            (path / "weights.safetensors").write_bytes(b"half")
+        run(tmp_path, settings(steps))
+        assert not (folder / ".step-00000099.partial").exists()
+        assert all((path / "weights.safetensors").exists() for path in others)
+
+
+@pytest.mark.parametrize("end", ["nan", "sigterm"])
+def test_the_log_is_written_and_what_loads_the_batches_is_closed_however_a_run_ends(tmp_path, end):
+    closed: list[bool] = []
+
+    class Watched(ToySource):
+        def batches(self, epoch, samples_consumed):
+            try:
+                yield from super().batches(epoch, samples_consumed)
+            finally:
+                closed.append(True)
+
+    def report(made: StepReport) -> None:
+        if made.step == 5 and end == "sigterm":
+            signal.raise_signal(signal.SIGTERM)
+
+    expected = NonFiniteLossError if end == "nan" else TrainingStopped
+    source = Watched(4, poison=20 if end == "nan" else None)
+    threads = threading.active_count()
+    with pytest.raises(expected) as caught:
+        run(tmp_path, settings(20), source=source, report=report)
+    assert closed == [True]
+    assert threading.active_count() == threads  # the log's writer has one
+    assert caught.value.__traceback__ is not None  # which keeps alive what its frames hold
+    log = EventAccumulator(str(tmp_path / "tensorboard")).Reload()  # what is in the file by now
+    assert [event.step for event in log.Scalars("training/loss")] == [1, 2, 3, 4, 5]
+
+
+def test_a_figure_without_a_number_is_not_logged(tmp_path):
+    evaluation = Evaluation(figures={"known": 1.5, "nothing": math.nan, "endless": math.inf}, pictures={})
+    run(tmp_path, settings(4, validate_every=4), validate=lambda: evaluation)
+    log = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    assert [tag for tag in log.Tags()["scalars"] if tag.startswith("validation/")] == ["validation/known"]
 
 
 def test_waiting_and_speed_are_reported(tmp_path):

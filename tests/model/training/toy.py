@@ -5,7 +5,7 @@ Also a program, for tests over several processes: `python toy.py FOLDER STEPS GL
 
 import sys
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -62,12 +62,19 @@ class ToySource:
     """Epochs of EPOCH samples in natural order; each rank takes its part of every global batch."""
 
     def __init__(
-        self, global_batch: int, *, rank: int = 0, ranks: int = 1, poison: int | None = None
+        self,
+        global_batch: int,
+        *,
+        rank: int = 0,
+        ranks: int = 1,
+        poison: int | None = None,
+        data_sha256: str = "colours",
     ) -> None:
         self.global_batch, self.rank, self.ranks, self.poison = global_batch, rank, ranks, poison
+        self.data_sha256 = data_sha256
         self.seen: list[int] = []
 
-    def batches(self, epoch: int, samples_consumed: int) -> Iterator[PlacedBatch]:
+    def batches(self, epoch: int, samples_consumed: int) -> Generator[PlacedBatch, None, None]:
         while True:
             if samples_consumed >= EPOCH:
                 epoch, samples_consumed = epoch + 1, 0

@@ -11,10 +11,11 @@ from torch import Tensor, nn
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
+from model.networks.lora import add_lora, trainable_parameters
 from model.networks.sparse.tensor import SparseTensor
-from model.structured_latent.decoder import GaussianDecoder, SurfaceDecoder
-from model.structured_latent.encoder import SlatEncoder
-from model.structured_latent.flow import SlatFlow, SlatFlowConfig
+from model.slat_config import SlatTrainingConfig, load_any_config
+from model.structured_latent.decoder import SurfaceDecoder
+from model.structured_latent.flow import SlatFlow
 from model.structured_latent.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.weights.published import ImportReport, find_published, import_networks, published_shapes
@@ -30,68 +31,39 @@ from model.weights.slat import (
 )
 from model.weights.weight_file import load_weights
 from tests.model.structured_latent.small_slat import PAPER_FLOW
+from tests.model.weights import published_slat
 from tests.model.weights.published import refused
+from tests.model.weights.published_slat import DECODER, ENCODER, FLOW, GAUSSIAN, modules
 
-RESEARCH = Path(__file__).resolve().parents[4] / "shared/research/trellis_parameters.json"
-FLOW, ENCODER = "slat_flow_img_dit_L_64l8p2", "slat_enc_swin8_B_64l8"
-DECODER, GAUSSIAN = "slat_dec_mesh_swin8_B_64l8m256c", "slat_dec_gs_swin8_B_64l8gs32"
+ROOT = Path(__file__).resolve().parents[3]
+RESEARCH = ROOT.parent / "shared/research/trellis_parameters.json"
 PREFIXES = {FLOW: SLAT_FLOW, ENCODER: SLAT_ENCODER, DECODER: SURFACE, GAUSSIAN: GAUSSIANS}
-CLASSES = {
-    FLOW: "SLatFlowModel",
-    ENCODER: "SLatEncoder",
-    DECODER: "SLatMeshDecoder",
-    GAUSSIAN: "SLatGaussianDecoder",
-}
-PAPER_VAE = SlatVaeConfig(
-    feature_channels=1024,
-    channels=768,
-    latent_channels=8,
-    blocks=12,
-    heads=12,
-    mlp_ratio=4,
-    window=8,
-    upsample=(192, 96),
-    resolution=64,
-)
 SMALL_FLOW = replace(
     PAPER_FLOW, resolution=8, channels=16, condition_channels=12, blocks=2, heads=2, io_channels=(8,)
 )
-SMALL_VAE = replace(
-    PAPER_VAE,
+SMALL_VAE = SlatVaeConfig(
     feature_channels=10,
     channels=16,
+    latent_channels=8,
     blocks=2,
     heads=2,
+    mlp_ratio=4,
     window=4,
     upsample=(8, 4),
     resolution=8,
 )
 
 
-def modules(flow: SlatFlowConfig, vae: SlatVaeConfig) -> dict[str, nn.Module]:
-    return {
-        FLOW: SlatFlow(flow),
-        ENCODER: SlatEncoder(vae),
-        DECODER: SurfaceDecoder(vae),
-        GAUSSIAN: GaussianDecoder(vae),
-    }
+@pytest.fixture(scope="module")
+def paper() -> SlatTrainingConfig:
+    """configs/model/paper_slat.yaml."""
+    config = load_any_config(ROOT / "configs" / "model" / "paper_slat.yaml")
+    assert isinstance(config, SlatTrainingConfig)
+    return config
 
 
 def write_published(folder: Path) -> dict[str, dict[str, Tensor]]:
-    """Small files as TRELLIS would publish them, with random float16 values; their tensors."""
-    folder.mkdir(parents=True, exist_ok=True)
-    generator, written = torch.Generator().manual_seed(0), {}
-    for name, module in modules(SMALL_FLOW, SMALL_VAE).items():
-        tensors = {
-            key: tensor.half()
-            if key == "offset_perturbation"
-            else (0.2 * torch.randn(tensor.shape, generator=generator)).half()
-            for key, tensor in module.state_dict().items()
-        }
-        save_file(tensors, folder / f"{name}_fp16.safetensors")
-        (folder / f"{name}_fp16.json").write_text(json.dumps({"name": CLASSES[name], "args": {}}))
-        written[name] = tensors
-    return written
+    return published_slat.write_published(folder, SMALL_FLOW, SMALL_VAE)
 
 
 def run(source: Path, out: Path) -> ImportReport:
@@ -102,19 +74,38 @@ def fails(source: Path, out: Path, *parts: str) -> None:
     refused(lambda: run(source, out), out, *parts)
 
 
-def test_paper_sizes_have_the_published_names_and_shapes() -> None:
+def test_the_paper_configuration_has_the_published_names_and_shapes(paper: SlatTrainingConfig) -> None:
+    flow, vae = paper.slat_flow.network, paper.slat_vae.network
+    assert flow == PAPER_FLOW
     with torch.device("meta"):
-        networks = modules(PAPER_FLOW, PAPER_VAE)
+        networks = modules(flow, vae)
     for name, module in networks.items():
         assert shapes_of(module) == published_shapes(name)
-    for network in slat_networks(PAPER_FLOW, PAPER_VAE):
+    for network in slat_networks(flow, vae):
         assert shapes_of(network.module) == network.shapes
 
 
+def test_adapters_of_the_paper_configuration_are_on_every_attention_projection(
+    paper: SlatTrainingConfig,
+) -> None:
+    assert paper.slat_flow.lora is not None
+    with torch.device("meta"):
+        flow = SlatFlow(paper.slat_flow.network)
+        add_lora(flow, paper.slat_flow.lora)
+    adapted = {name.rpartition(".lora_")[0] for name in trainable_parameters(flow)}
+    assert adapted == {
+        f"blocks.{block}.{layer}"
+        for block in range(24)
+        for layer in ("self_attn.to_qkv", "self_attn.to_out", "cross_attn.to_q", "cross_attn.to_kv")
+    } | {f"blocks.{block}.cross_attn.to_out" for block in range(24)}
+    ranks = {shape[0] for name, shape in trainable_parameters(flow).items() if ".lora_A." in name}
+    assert ranks == {64}
+
+
 @pytest.mark.skipif(not RESEARCH.exists(), reason="the research notes are not part of the repository")
-def test_manifest_and_sizes_repeat_the_research_notes() -> None:
+def test_manifest_and_sizes_repeat_the_research_notes(paper: SlatTrainingConfig) -> None:
     research = json.loads(RESEARCH.read_text())
-    for network in slat_networks(PAPER_FLOW, PAPER_VAE):
+    for network in slat_networks(paper.slat_flow.network, paper.slat_vae.network):
         noted = research[network.name]
         assert {key: tuple(shape) for key, shape in noted["parameters"].items()} == network.shapes
         assert {name: noted["args"][name] for name in network.arguments} == network.arguments
