@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from model.bounded_cache import BoundedCache
 from model.clip_frames import BLOB_COLUMNS, ClipFrames
 from model.crop import CroppedMasks, SquareCrop, crop_image, crop_masks, draw_crop, mirrored, union_box
 from model.data_order import RandomStream, SampleKey, random_stream
-from model.frame_pages import FramePages, local_pages
 from model.motion_index import FRAME_COLUMNS, MotionIndex, MotionRef
 from model.sample import OCCUPANCY_VOXELS, ObjectSurface, TrainingSample
 from model.stream_config import StreamConfig
+from shards.bounded_cache import BoundedCache
 from shards.errors import CorruptShardError, ImageError, RowError
+from shards.frame_pages import FramePages, local_pages
 from shards.reader import Table
 from shards.schema import ObjectRow
 

@@ -49,10 +49,11 @@ class DinoConfig:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DinoEncoder:
-    """Patch tokens before DINOv2's last norm, layer-normalised without parameters; no CLS, no registers."""
+    """Patch tokens before DINOv2's last norm; no CLS, no registers."""
 
     network: Dinov2WithRegistersModel
     config: DinoConfig
+    normed: bool  # layer-normalised without parameters, as TRELLIS conditions on them
 
     @property
     def grid(self) -> int:
@@ -75,8 +76,9 @@ class DinoEncoder:
         embedded = self.network.embeddings(((pixels - mean) / std).to(self.network.dtype))
         tokens = self.network.encoder(embedded).last_hidden_state
         patches = tokens[:, 1 + self.network.config.num_register_tokens :]
-        normed = functional.layer_norm(patches, patches.shape[-1:])
-        return normed.unflatten(0, images.shape[:2]).to(images.dtype)
+        if self.normed:
+            patches = functional.layer_norm(patches, patches.shape[-1:])
+        return patches.unflatten(0, images.shape[:2]).to(images.dtype)
 
 
 def load_dino(config: DinoConfig) -> DinoEncoder:
@@ -99,7 +101,7 @@ def load_dino(config: DinoConfig) -> DinoEncoder:
     network, report = loaded
     if missing := sorted(set(report["missing_keys"]) - _SKIPPABLE):
         raise _unusable(source, f"{len(missing)} weights are missing, first {missing[0]}")
-    return DinoEncoder(network=network.eval().requires_grad_(False), config=config)
+    return DinoEncoder(network=network.eval().requires_grad_(False), config=config, normed=True)
 
 
 def _require_dino(source: str, found: dict[str, Any]) -> None:

@@ -11,7 +11,7 @@ from model.networks.sparse.tensor import SparseTensor
 from model.sample import ObjectSurface
 from model.structured_latent.prediction import decoded_fields
 from model.surface.extraction import ExtractionConfig, extract_surface
-from model.surface.mesh import SurfaceMesh, check_manifold
+from model.surface.mesh import MeshReport, SurfaceMesh, check_manifold
 
 __all__ = ["MeshEvaluationConfig", "ScoredMesh", "mean_scores", "scored_mesh"]
 
@@ -30,7 +30,9 @@ class ScoredMesh:
 
     mesh: SurfaceMesh | None
     score: SurfaceScore | None
-    manifold: bool  # closed, oriented, manifold (model.surface.mesh.check_manifold)
+    report: (
+        MeshReport | None
+    )  # None: it is not closed, oriented and manifold (model.surface.mesh.check_manifold)
 
 
 def scored_mesh(
@@ -40,30 +42,33 @@ def scored_mesh(
     try:
         mesh = extract_surface(decoded_fields(decoded, sample), config.extraction).mesh
     except ModelError:  # no voxel, nothing inside, or numbers that are not finite: counted by `mean_scores`
-        return ScoredMesh(mesh=None, score=None, manifold=False)
+        return ScoredMesh(mesh=None, score=None, report=None)
     try:
-        check_manifold(mesh)
-        manifold = True
+        report = check_manifold(mesh)
     except ModelError:
-        manifold = False
+        report = None
     score = surface_score(mesh, truth, config.samples, np.random.default_rng(0))
-    return ScoredMesh(mesh=mesh, score=score, manifold=manifold)
+    return ScoredMesh(mesh=mesh, score=score, report=report)
 
 
 def mean_scores(meshes: Sequence[ScoredMesh]) -> dict[str, float]:
     """Means over objects. An object without a mesh counts as F-score 0 and infinite distance, and is counted.
 
-    f_5mm, f_10mm and manifold are percent, chamfer_cm is MagicHOI's sum, color is sRGB 0..1.
+    f_5mm, f_10mm and manifold are percent, chamfer_cm is MagicHOI's sum, color is sRGB 0..1; handles (genus) and
+    components, of manifold meshes only, tell ragged surfaces that the F-score does not see.
     """
     found = [mesh.score for mesh in meshes if mesh.score is not None]
     count = max(len(meshes), 1)
     missing = len(meshes) - len(found)
+    reports = [mesh.report for mesh in meshes if mesh.report is not None]
     return {
         "f_5mm": sum(score.points.f_5mm for score in found) / count,
         "f_10mm": sum(score.points.f_10mm for score in found) / count,
         "chamfer_cm": float("inf") if missing else sum(score.points.chamfer_cm for score in found) / count,
         "normal_deg": sum(score.normal_deg for score in found) / max(len(found), 1),
         "color_error": sum(score.color for score in found) / max(len(found), 1),
-        "manifold": 100.0 * sum(mesh.manifold for mesh in meshes) / count,
+        "manifold": 100.0 * len(reports) / count,
+        "handles": sum(report.genus for report in reports) / max(len(reports), 1),
+        "components": sum(report.components for report in reports) / max(len(reports), 1),
         "without_mesh": float(missing),
     }

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from model.bounded_cache import BoundedCache
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
 from model.sample import Batch, ObjectSurface, SurfaceBatch
 from model.structured_latent.features import VoxelFeatures, object_features
 from model.structured_latent.view_features import ViewFeatures
+from shards.bounded_cache import BoundedCache
 
 __all__ = ["ObjectInput", "ObjectInputs", "object_surface"]
 

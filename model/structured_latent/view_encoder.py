@@ -1,18 +1,14 @@
 """The configured image encoder, as features of voxels are made with it."""
 
 import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
-from transformers.image_utils import IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD
 
 from model.encoders.cached import CachedEncoder
 from model.encoders.dino import DinoEncoder
 from model.encoders.efficientnet import EfficientNetEncoder
 from model.encoders.protocol import FeatureEncoder
-from model.encoders.token_grid import resized
 from model.errors import ModelError
 
 __all__ = ["ViewEncoder", "view_encoder"]
@@ -45,39 +41,5 @@ def view_encoder(conditioning: FeatureEncoder) -> ViewEncoder:
     for name, tensor in sorted(network.state_dict().items()):
         digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)};".encode())
         digest.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().data)
-    encoder = UnnormedDino(inner=inner) if isinstance(inner, DinoEncoder) else inner
+    encoder = replace(inner, normed=False) if isinstance(inner, DinoEncoder) else inner
     return ViewEncoder(encoder=encoder, digest=digest.hexdigest())
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class UnnormedDino:
-    """Patch tokens of the last block as they are (`x_prenorm`)."""
-
-    inner: DinoEncoder
-
-    @property
-    def grid(self) -> int:
-        return self.inner.grid
-
-    @property
-    def channels(self) -> int:
-        return self.inner.channels
-
-    def to(self, device: torch.device | str, dtype: torch.dtype) -> "UnnormedDino":
-        self.inner.to(device, dtype)
-        return self
-
-    @torch.no_grad()
-    def __call__(
-        self, images: Float[Tensor, "batch view 3 size size"]
-    ) -> Float[Tensor, "batch view token channel"]:
-        network = self.inner.network
-        pixels = resized(images.flatten(0, 1), self.inner.config.image_size)
-        mean, std = (
-            torch.tensor(values).to(pixels).reshape(3, 1, 1)
-            for values in (IMAGENET_DEFAULT_MEAN, IMAGENET_DEFAULT_STD)
-        )
-        embedded = network.embeddings(((pixels - mean) / std).to(network.dtype))
-        tokens = network.encoder(embedded).last_hidden_state
-        patches = tokens[:, 1 + network.config.num_register_tokens :]
-        return patches.unflatten(0, images.shape[:2]).to(images.dtype)

@@ -14,13 +14,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from model.bounded_cache import BoundedCache
 from model.errors import ModelError
 from model.structured_latent.features import projected_features
 from model.structured_latent.object_mesh import MeshRecord, ObjectMeshes
 from model.structured_latent.object_views import RENDERING, object_views
 from model.structured_latent.view_encoder import ViewEncoder
 from model.weights.safetensors_file import read_header, read_tensors, write_tensors
+from shards.bounded_cache import BoundedCache
 
 __all__ = ["ViewFeatures", "ViewFeaturesConfig"]
 

@@ -7,6 +7,7 @@ import torch
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
 from model.flow import Guidance, SamplerSettings, UniformTime
+from model.networks.sparse.tensor import SparseTensor
 from model.sample import Batch
 from model.structured_latent.features import FEATURE_CHANNELS
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
@@ -18,6 +19,7 @@ from model.structured_latent.surface_loss import SurfaceLossConfig
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask, normal_rows
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.surface.extraction import ExtractionConfig
+from model.surface.fields import CHANNELS, CORNERS
 from model.training.draws import sample_generators
 from model.training.task import Task
 from tests.model.encoders.mean_color import MeanColor
@@ -183,6 +185,28 @@ def test_an_object_without_a_mesh_is_counted(flow_task, batch):
     assert figures["without_mesh"] == 1
     assert figures["f_10mm"] == 0
     assert figures["chamfer_cm"] == float("inf")
+
+
+def test_a_pierced_surface_shows_in_its_handles(batch):
+    """Of a ball's own distances: one component without handles. A third of the signs wrong: pierced, still manifold."""
+    voxels = torch.from_numpy(np.argwhere(batch.occupancy[0].numpy()))
+    corners = voxels[:, None].numpy() + CORNERS
+    channels = torch.zeros(len(voxels), CHANNELS)
+    channels[:, :8] = torch.from_numpy(ball_distance(0.2)(corners / 64 - 0.5) * 64).float() + 1 / 64
+    wrong = np.random.default_rng(0).random((65, 65, 65)) < 1 / 3
+    flips = torch.from_numpy(np.where(wrong[tuple(np.moveaxis(corners, -1, 0))], -1.0, 1.0)).float()
+    truth = object_surface(batch.true_surface, 0)
+
+    def figures(channels: torch.Tensor) -> dict[str, float]:
+        decoded = SparseTensor.from_samples([channels], [voxels], 64)
+        return mean_scores([scored_mesh(decoded, 0, truth, MESHES)])
+
+    clean = figures(channels)
+    assert (clean["handles"], clean["components"], clean["manifold"]) == (0, 1, 100)
+    pierced = channels.clone()
+    pierced[:, :8] *= flips
+    assert figures(pierced)["handles"] > 50
+    assert figures(pierced)["manifold"] == 100
 
 
 def test_a_batch_without_surfaces_is_refused(vae_task, batch):

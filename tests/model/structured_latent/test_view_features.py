@@ -170,6 +170,7 @@ def test_dinos_tokens_are_read_before_their_last_norm() -> None:
     )
     dino = DinoEncoder(
         network=network.eval().requires_grad_(False),
+        normed=True,
         config=DinoConfig(source="none", image_size=56, local_files_only=True),
     )
     made = view_encoder(CachedEncoder(encoder=dino, max_views=2))

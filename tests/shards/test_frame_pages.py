@@ -7,8 +7,8 @@ import fsspec
 import numpy as np
 import pytest
 
-from model.frame_pages import local_pages
 from shards.errors import CorruptShardError
+from shards.frame_pages import local_pages
 from shards.images import encode_rgb_png
 from shards.parquet import ParquetSource
 from shards.reader import open_dataset

@@ -16,7 +16,7 @@ from typing import Any
 
 from fsspec.implementations.local import LocalFileSystem
 
-from model.bounded_cache import BoundedCache
+from shards.bounded_cache import BoundedCache
 from shards.errors import ChecksumError, CorruptShardError, StorageError
 from shards.parquet import COPY_AGAIN, ParquetSource
 
