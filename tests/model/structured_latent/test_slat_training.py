@@ -1,5 +1,7 @@
 """The stage-2 tasks on small networks: losses fall, samples are independent, predictions repeat, tables are honest."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -14,7 +16,7 @@ from model.structured_latent.flow import SlatFlow, SlatFlowConfig
 from model.structured_latent.flow_training import LATENT, SlatFlowTask, SlatFlowTraining
 from model.structured_latent.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, mean_scores, scored_mesh
-from model.structured_latent.object_input import object_surface
+from model.structured_latent.object_input import ObjectInputs, object_surface
 from model.structured_latent.surface_loss import SurfaceLossConfig
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask, normal_rows
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
@@ -68,7 +70,9 @@ def batch() -> Batch:
 @pytest.fixture
 def vae_task() -> SlatVaeTask:
     torch.manual_seed(0)
-    return SlatVaeTask(network=SlatVae(VAE), loss_config=LOSS, evaluation=MESHES)
+    return SlatVaeTask(
+        network=SlatVae(VAE), loss_config=LOSS, evaluation=MESHES, inputs=ObjectInputs(of_views=None)
+    )
 
 
 @pytest.fixture
@@ -92,6 +96,7 @@ def flow_task(vae_task) -> SlatFlowTask:
             guidance=Guidance(strength={LATENT: 1.0}, interval=(0.5, 1.0)),
         ),
         evaluation=MESHES,
+        inputs=ObjectInputs(of_views=None),
     )
 
 
@@ -184,7 +189,9 @@ def test_an_object_without_a_mesh_is_counted(flow_task, batch):
     figures = mean_scores([scored_mesh(outside, 0, truth, MESHES)])
     assert figures["without_mesh"] == 1
     assert figures["f_10mm"] == 0
-    assert figures["chamfer_cm"] == float("inf")
+    assert figures["chamfer_cm"] == pytest.approx(200 * math.sqrt(3) * truth.object_scale_m)
+    assert math.isnan(figures["normal_deg"])  # not 0, which would be perfect
+    assert math.isnan(figures["handles"])
 
 
 def test_a_pierced_surface_shows_in_its_handles(batch):
