@@ -24,6 +24,7 @@ def small_config(dataset: Path, cache: Path | None) -> SlatTrainingConfig:
     settings["encoders"] |= {"image": {"image_size": 64, "grid": 8}, "hand": {"packaged_grid": 8}}
     settings["meshes"]["samples"] = 500
     settings["slat_vae"]["network"] |= {"feature_channels": 568, "channels": 12, "blocks": 1}
+    settings["slat_vae"]["loss"]["kl"] = 0.0001  # else the first steps mostly shrink the latents
     settings["slat_vae"]["features"] = {
         "views": 4,
         "image_size": 64,
