@@ -16,7 +16,7 @@ from torch import Tensor
 
 from model.encoders.protocol import FeatureEncoder
 
-__all__ = ["CachedEncoder"]
+__all__ = ["CachedEncoder", "uncached"]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,6 +55,11 @@ class CachedEncoder:
                 if len(self._kept) < self.max_views:
                     self._kept[key] = value.clone()  # a row would keep the whole batch alive
         return torch.stack([tokens[key] for key in keys]).unflatten(0, images.shape[:2])
+
+
+def uncached(encoder: FeatureEncoder) -> FeatureEncoder:
+    """The encoder below the cache, or the same one."""
+    return encoder.encoder if isinstance(encoder, CachedEncoder) else encoder
 
 
 def _content(view: Float[Tensor, "3 size size"]) -> bytes:

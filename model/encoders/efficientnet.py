@@ -9,7 +9,6 @@ s (i + 1) - 0.5. The trained kernels make up for it: what moves a cell's value i
 within 1.2 px at every stride (moving a spot over 224 px), so maps are read as cells that share out the side.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -71,15 +70,14 @@ class ImageNetPyramid(nn.Module):
         self, images: Float[Tensor, "view 3 size size"]
     ) -> dict[int, Float[Tensor, "view channel i j"]]:
         """Stride -> map (PYRAMID_CHANNELS), of sRGB pictures in 0..1 whose side is a multiple of 32."""
-        return dict(self._levels(images))
-
-    def _levels(self, images: Tensor) -> Iterator[tuple[int, Tensor]]:
         pixels = ((255 * images - 127) / 128).to(self.network._conv_stem.weight.dtype)
         features = self.network._swish(self.network._bn0(self.network._conv_stem(pixels)))
+        levels = {}
         for index, block in enumerate(self.network._blocks):
             features = block(features)
             if index in _STRIDE_AFTER_BLOCK:
-                yield _STRIDE_AFTER_BLOCK[index], features
+                levels[_STRIDE_AFTER_BLOCK[index]] = features
+        return levels
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -10,9 +10,7 @@ from pathlib import Path
 import torch
 
 from model.config import TrainingConfig
-from model.encoders.cached import CachedEncoder
-from model.encoders.hand import HandEncoder, HandNet, packaged_hand_net
-from model.encoders.protocol import FeatureEncoder
+from model.encoders.hand import HandNet, packaged_hand_net
 from model.errors import ModelError
 from model.slat_config import SlatTrainingConfig, parse_any_config
 from model.sparse_structure.stage_one import StageOneTask
@@ -130,7 +128,8 @@ def load_networks(one: StageOneRun, two: StageTwoRun | None, device: torch.devic
     task = load_stage_one(one.config, one.folder, device)
     stage_one = StageOneNetworks(
         task=task,
-        hand=_hand_net(task.hand_encoder).to(device),
+        # Where stage 1 looks through another kind of hand encoder, the packaged one finds the hand.
+        hand=(task.hand_net or packaged_hand_net()).to(device),
         image_size=one.config.stage_one.recipe.image_size,
         crop_margin=one.config.data.augmentation.switched_off().margin[0],
     )
@@ -142,12 +141,6 @@ def load_networks(one: StageOneRun, two: StageTwoRun | None, device: torch.devic
         )
     checkpoints = (*one.checkpoints, *(two.checkpoints if two is not None else ()))
     return Networks(stage_one=stage_one, stage_two=stage_two, device=device, checkpoints=checkpoints)
-
-
-def _hand_net(encoder: FeatureEncoder) -> HandNet:
-    """The one that stage 1 looks through, or the packaged one where it has another kind of hand encoder."""
-    inner = encoder.encoder if isinstance(encoder, CachedEncoder) else encoder
-    return inner.network if isinstance(inner, HandEncoder) else packaged_hand_net()
 
 
 def _config(run: Path, part: str) -> TrainingConfig | SlatTrainingConfig:

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from model.encoders.aggregator import FeatureAggregator
-from model.encoders.hand import HandNet
+from model.encoders.cached import uncached
+from model.encoders.hand import HandEncoder, HandNet
 from model.encoders.protocol import FeatureEncoder
 from model.evaluation.overlap import intersection_over_union, voxel_chamfer
 from model.flow import (
@@ -82,11 +83,16 @@ class StageOneTask:
     vae: StructureVae  # frozen
     config: StageOneConfig
     mean_shape: Bool[Tensor, "64 64 64"]  # of the training objects: what a prediction has to beat
-    hand_net: HandNet | None  # the hand encoder's, where it finds visible objects: another thing to beat
 
     @property
     def module(self) -> nn.Module:
         return self.network
+
+    @property
+    def hand_net(self) -> HandNet | None:
+        """Of the hand encoder, if it is ours: it finds visible objects, and hands."""
+        inner = uncached(self.hand_encoder)
+        return inner.network if isinstance(inner, HandEncoder) else None
 
     def features(
         self, images: Float[Tensor, "batch view 3 size size"]
@@ -160,10 +166,7 @@ class StageOneTask:
         pictures: dict[str, np.ndarray] = {}
         for batch in batches:
             found = self.predict(batch.images, _noise_of(batch))
-            scores = _scores(batch, found, self.mean_shape)
-            if self.hand_net is not None:
-                visible = self.hand_net.visible_object(batch.images.flatten(0, 1))
-                scores |= _mask_scores(batch, visible, "found_visible_iou")
+            scores = _shape_scores(batch, found, self.mean_shape) | _mask_scores(batch, found, self.hand_net)
             for name, values in scores.items():
                 numbers[name] += values.tolist()
             if not pictures:
@@ -177,31 +180,31 @@ def _noise_of(batch: Batch) -> torch.Generator:
     return torch.Generator().manual_seed(int.from_bytes(digest))
 
 
-def _scores(
+def _shape_scores(
     batch: Batch, found: Prediction, mean_shape: Bool[Tensor, "64 64 64"]
 ) -> dict[str, Float[Tensor, " n"]]:
     guess = mean_shape.to(batch.occupancy.device).expand_as(batch.occupancy)
     chamfer = [voxel_chamfer(a.cpu(), b.cpu()) for a, b in zip(found.occupancy, batch.occupancy)]
-    masks = _full_size(found.masks, batch.images.shape[-1]).flatten(0, 1) > 0
     return {
         "voxel_iou": intersection_over_union(found.occupancy, batch.occupancy),
         "mean_shape_iou": intersection_over_union(guess, batch.occupancy),
         "chamfer": torch.tensor(chamfer),
         "empty": (~found.occupancy.flatten(1).any(1)).float(),
-        **_mask_scores(batch, masks, "mask_iou"),
-        **_mask_scores(batch, batch.object_visible.flatten(0, 1), "visible_iou"),
     }
 
 
-def _mask_scores(
-    batch: Batch, masks: Bool[Tensor, "flat size size"], name: str
-) -> dict[str, Float[Tensor, " n"]]:
-    """IoU of masks with the amodal ones, of every view and of those where much of the object is hidden."""
+def _mask_scores(batch: Batch, found: Prediction, hand_net: HandNet | None) -> dict[str, Float[Tensor, " n"]]:
+    """IoU of several masks with the amodal ones, of every view and of those where much of the object is hidden."""
     amodal, visible = batch.object_amodal.flatten(0, 1), batch.object_visible.flatten(0, 1)
-    iou = intersection_over_union(masks, amodal)
-    # A visible mask lies inside the amodal one.
-    occluded = intersection_over_union(visible, amodal) < 1 - OCCLUDED
-    return {name: iou, f"occluded_{name}": iou[occluded]}
+    masks = {
+        "mask_iou": _full_size(found.masks, amodal.shape[-1]).flatten(0, 1) > 0,
+        "visible_iou": visible,
+    }
+    if hand_net is not None:
+        masks["found_visible_iou"] = hand_net.visible_object(batch.images.flatten(0, 1))
+    iou = {name: intersection_over_union(mask, amodal) for name, mask in masks.items()}
+    occluded = iou["visible_iou"] < 1 - OCCLUDED  # a visible mask lies inside the amodal one
+    return iou | {f"occluded_{name}": values[occluded] for name, values in iou.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from model.encoders.cached import CachedEncoder
+from model.encoders.cached import uncached
 from model.encoders.dino import DinoEncoder
 from model.encoders.efficientnet import EfficientNetEncoder
 from model.encoders.protocol import FeatureEncoder
@@ -28,7 +28,7 @@ def view_encoder(conditioning: FeatureEncoder) -> ViewEncoder:
     TRELLIS conditions on layer-normed tokens, but its SLat encoder reads them as they are (FORMATS 4.5). ModelError
     for an encoder of another kind than the configurations know.
     """
-    inner = conditioning.encoder if isinstance(conditioning, CachedEncoder) else conditioning
+    inner = uncached(conditioning)
     if not isinstance(inner, DinoEncoder | EfficientNetEncoder):
         raise ModelError(
             "view features",

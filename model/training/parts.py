@@ -24,7 +24,6 @@ from model.config import (
     as_yaml,
 )
 from model.data import ShardStream
-from model.encoders.cached import CachedEncoder
 from model.encoders.hand import HandEncoder, HandNet, save_hand_net
 from model.encoders.hand_training import HandTask
 from model.encoders.protocol import FeatureEncoder
@@ -164,14 +163,7 @@ def _stage_one_task(
             latent_scale=facts.latent_scale,
         ),
         mean_shape=facts.mean_shape,
-        hand_net=_hand_net(hand),
     )
-
-
-def _hand_net(encoder: FeatureEncoder) -> HandNet | None:
-    """The network below a hand encoder, if it is ours."""
-    inner = encoder.encoder if isinstance(encoder, CachedEncoder) else encoder
-    return inner.network if isinstance(inner, HandEncoder) else None
 
 
 def _start(network: StageOne, part: StageOnePart) -> None:

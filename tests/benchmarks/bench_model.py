@@ -74,7 +74,6 @@ def stage_one_task(config: TrainingConfig) -> StageOneTask:
             latent_scale=1.0,
         ),
         mean_shape=torch.zeros(64, 64, 64, dtype=torch.bool),
-        hand_net=None,
     )
 
 

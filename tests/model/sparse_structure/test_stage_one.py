@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
-from model.encoders.hand import HandNet, HandNetConfig
+from model.encoders.cached import CachedEncoder
+from model.encoders.hand import HandEncoder, HandNet, HandNetConfig
 from model.flow import Guidance, SamplerSettings, UniformTime
 from model.sample import Batch
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
@@ -62,7 +63,6 @@ def task() -> StageOneTask:
             latent_scale=1.0,
         ),
         mean_shape=torch.zeros(64, 64, 64, dtype=torch.bool),
-        hand_net=None,
     )
 
 
@@ -134,11 +134,18 @@ def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
 def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(task, batch):
     assert math.isnan(task.evaluate([batch]).figures["found_visible_iou"])  # no network of ours
     network = HandNet(HandNetConfig(image_size=32, stem=(8, 8), decoder=8)).eval()
+    encoder = HandEncoder(network=network, grid=2)
+    sizes = replace(task.network.aggregator.config, hand_channels=encoder.channels)
+    looking = replace(
+        task,
+        network=StageOne(FeatureAggregator(sizes), task.network.flow),
+        hand_encoder=CachedEncoder(encoder=encoder, max_views=9),
+    )
     for bias, expected in ((50.0, float(batch.object_amodal.float().mean())), (-50.0, 0.0)):
         with torch.no_grad():  # the object everywhere, then nowhere
             network.maps.weight[1] = 0.0
             network.maps.bias[1] = bias
-        figures = replace(task, hand_net=network).evaluate([batch]).figures
+        figures = looking.evaluate([batch]).figures
         assert figures["found_visible_iou"] == pytest.approx(expected)
         assert figures["occluded_found_visible_iou"] == pytest.approx(expected)
 

@@ -4,7 +4,9 @@ from collections.abc import Callable
 
 import numpy as np
 
+from datagen.objects.fields import LearningTargets
 from model.sample import Batch, ObjectSurface, join_surfaces
+from shards.schema import ObjectRow
 
 RESOLUTION = 64
 
@@ -73,6 +75,18 @@ def shell(distance: Distance, resolution: int = RESOLUTION) -> np.ndarray:
         for k in (0, 1)
     ]
     return np.any(corners, axis=0) & ~np.all(corners, axis=0)
+
+
+def surface_of(row: ObjectRow | LearningTargets) -> ObjectSurface:
+    """The samples of an object, as they are stored or as the generator makes them."""
+    return ObjectSurface(
+        points=row.surface_points,
+        normals=row.surface_normals,
+        colors=row.surface_colors,
+        sdf_points=row.sdf_points,
+        sdf_values=row.sdf_values,
+        object_scale_m=row.object_scale_m,
+    )
 
 
 def batch_of(*objects: tuple[ObjectSurface, np.ndarray], views: int = 2, size: int = 32) -> Batch:

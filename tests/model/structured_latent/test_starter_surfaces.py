@@ -15,7 +15,7 @@ from model.slat_config import SlatTrainingConfig, SlatVaePart, load_any_config
 from model.structured_latent.object_input import ObjectInputs
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask
 from model.training.draws import sample_generators
-from tests.model.structured_latent.solids import RESOLUTION, batch_of
+from tests.model.structured_latent.solids import RESOLUTION, batch_of, surface_of
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 STEPS, BATCH = 60, 2  # of the 1,500 x 4 that small_slat.yaml takes: more can only help
@@ -27,15 +27,7 @@ def starter_object(pack: StarterPack, uid: str, config: TargetsConfig) -> tuple[
     targets = learning_targets(pack.load(uid), 0, config)
     occupancy = np.zeros((RESOLUTION,) * 3, bool)
     occupancy[tuple(targets.occupancy_64.T)] = True
-    surface = ObjectSurface(
-        points=targets.surface_points,
-        normals=targets.surface_normals,
-        colors=targets.surface_colors,
-        sdf_points=targets.sdf_points,
-        sdf_values=targets.sdf_values,
-        object_scale_m=targets.object_scale_m,
-    )
-    return surface, occupancy
+    return surface_of(targets), occupancy
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from model.encoders.cached import CachedEncoder
 from model.encoders.dino import DinoConfig, DinoEncoder
 from model.encoders.efficientnet import EfficientNetConfig, load_efficientnet
 from model.errors import ModelError
-from model.sample import Batch, ObjectSurface, join_surfaces
+from model.sample import Batch, join_surfaces
 from model.structured_latent.object_input import ObjectInputs
 from model.structured_latent.object_mesh import ObjectMeshes
 from model.structured_latent.view_encoder import ViewEncoder, view_encoder
@@ -23,7 +23,7 @@ from shards.reader import open_dataset
 from shards.schema import ObjectRow
 from tests.model.data.balls import uid_of_split
 from tests.model.encoders.mean_color import MeanColor
-from tests.model.structured_latent.solids import batch_of
+from tests.model.structured_latent.solids import batch_of, surface_of
 from tests.model.structured_latent.textured_ball import write_textured_balls
 
 UID = uid_of_split("train", 0)
@@ -141,15 +141,7 @@ def test_autocast_does_not_change_what_is_kept(data, encoder, occupancy) -> None
 
 def test_samples_of_a_batch_get_the_features_of_their_objects(data, encoder, occupancy) -> None:
     """The second sample is the first in a mirror: `is_mirrored` travels from the stream to the features."""
-    row = row_of(data[True])
-    surface = ObjectSurface(
-        points=row.surface_points,
-        normals=row.surface_normals,
-        colors=row.surface_colors,
-        sdf_points=row.sdf_points,
-        sdf_values=row.sdf_values,
-        object_scale_m=row.object_scale_m,
-    )
+    surface = surface_of(row_of(data[True]))
     both = [surface, mirrored_surface(surface)]
     shapes = [occupancy, np.ascontiguousarray(occupancy[::-1])]
     batch = Batch(**vars(batch_of(*zip(both, shapes))) | {"surface": join_surfaces(both, [UID, UID])})
