@@ -11,7 +11,7 @@ sys.path.insert(0, str(ROOT))
 sys.path += [str(path) for path in (ROOT / ".venv").glob("lib/python3.11/site-packages")]
 
 from datagen.blender.window import open_in_window
-from datagen.scene_file import load_scene
+from datagen.scene.scene_file import load_scene
 
 if __name__ == "__main__":
     open_in_window(load_scene(Path(sys.argv[sys.argv.index("--") + 1])))

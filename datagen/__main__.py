@@ -1,5 +1,5 @@
 """`python -m datagen` is the `datagen` command."""
 
-from datagen.cli import main
+from datagen.cli.main import main
 
 main()

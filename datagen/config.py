@@ -11,15 +11,15 @@ from pathlib import Path
 
 import yaml
 
+from datagen.annotation.rows import ShardConfig
 from datagen.grasps.config import GraspConfig
-from datagen.hand_source import HandConfig, resolved_hand
-from datagen.library import ObjectsConfig
-from datagen.motion_source import MotionsConfig
-from datagen.objects.fields import TargetsConfig
-from datagen.pack import ShardConfig
-from datagen.plan import PlanConfig
+from datagen.objects.targets.learning_targets import TargetsConfig
+from datagen.plan.plan import PlanConfig
+from datagen.plan.selection_rules import SelectionConfig
 from datagen.sampling.config import SamplingConfig
-from datagen.selection import SelectionConfig
+from datagen.sources.hands import HandConfig, resolved_hand
+from datagen.sources.motions import MotionsConfig
+from datagen.sources.objects import ObjectsConfig
 from datagen.version import generator_commit
 from shards.records import Provenance
 from shards.settings import SettingsError, settings_from_dict

@@ -7,10 +7,10 @@ import numpy as np
 
 from shards.array_types import Bool, Float
 from shards.geometry import project_points, transform_points
-from shards.images import Geometry, Masks, mask_box_px
 from shards.reader import Frame, Frames
 from shards.schema import ClipRow, FrameRow, ObjectRow
 from shards.splits import SplitRule, split_of_object
+from shards.storage.images import Geometry, Masks, mask_box_px
 
 __all__ = ["clip_problems", "frame_problems", "object_problems"]
 

@@ -23,10 +23,10 @@ from shards.errors import (
     MissingColumnError,
     StorageError,
 )
-from shards.images import Geometry, Masks, decode_geometry, decode_masks, decode_rgb
-from shards.parquet import COPY_AGAIN, ParquetSource
 from shards.records import DatasetRecord, ShardRecord, parse_record
 from shards.schema import ROW_TYPES, ClipRow, FrameRow, ObjectRow
+from shards.storage.images import Geometry, Masks, decode_geometry, decode_masks, decode_rgb
+from shards.storage.parquet import COPY_AGAIN, ParquetSource
 
 __all__ = ["Dataset", "Frame", "Frames", "Shard", "Table", "open_dataset", "open_shard"]
 

@@ -23,7 +23,6 @@ from shards.errors import (
     ShardError,
     storage_error,
 )
-from shards.parquet import ParquetSource, file_metadata, file_record, local_source, parquet_writer
 from shards.records import (
     DatasetRecord,
     MotionRecord,
@@ -35,6 +34,7 @@ from shards.records import (
     write_record,
 )
 from shards.schema import ROW_TYPES, SCHEMA_VERSION, ClipRow, FrameRow, ObjectRow
+from shards.storage.parquet import ParquetSource, file_metadata, file_record, local_source, parquet_writer
 
 __all__ = [
     "begin_dataset",

@@ -8,8 +8,8 @@ import numpy as np
 from datagen.blender.axes import SENSOR_WIDTH_MM, blender_lens, world_from_blender_camera
 from datagen.blender.geometry import add_mesh, add_object_mesh, add_vertex_attribute, set_pose, set_vertices
 from datagen.blender.lights import add_light
-from datagen.blender.materials import object_material
-from datagen.blender.skin import (
+from datagen.blender.shading.object_materials import object_material
+from datagen.blender.shading.skin import (
     ARM_BLEND,
     ARM_COLOR,
     REST,
@@ -17,10 +17,10 @@ from datagen.blender.skin import (
     skin_materials,
     sleeve_material,
 )
-from datagen.blender.surfaces import table_material, table_uv
+from datagen.blender.shading.table_material import table_material, table_uv
 from datagen.blender.world import add_world
-from datagen.scene import SLEEVE, CameraPath, Scene, Table
-from datagen.table_mesh import table_mesh
+from datagen.scene.scene import SLEEVE, CameraPath, Scene, Table
+from datagen.scene.table_mesh import table_mesh
 from shards.geometry import invert_transform, transform_points
 
 __all__ = ["BuiltScene", "PassIndex", "build_scene", "show_frame", "use_camera"]

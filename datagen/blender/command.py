@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from datagen.blender.devices import DeviceError, DeviceRequest
-from datagen.blender.images import TextureError
 from datagen.blender.log import RenderError, progress_channel
 from datagen.blender.passes import render_passes
 from datagen.blender.render import render_scene
-from datagen.child import die_with_parent
-from datagen.scene_file import SceneFileError, load_scene
+from datagen.blender.shading.images import TextureError
+from datagen.processes.child_process import die_with_parent
+from datagen.scene.scene_file import SceneFileError, load_scene
 
 __all__ = ["main"]
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from mathutils import Matrix
 
-from datagen.objects.mesh import ObjectMesh
+from datagen.objects.mesh.object_mesh import ObjectMesh
 
 __all__ = ["add_mesh", "add_object_mesh", "add_vertex_attribute", "set_pose", "set_vertices"]
 

@@ -3,7 +3,7 @@
 import bpy
 from mathutils import Vector
 
-from datagen.scene import AreaLight
+from datagen.scene.scene import AreaLight
 
 __all__ = ["add_light"]
 

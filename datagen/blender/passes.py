@@ -12,7 +12,7 @@ from datagen.blender.build import build_scene, show_frame, use_camera
 from datagen.blender.devices import select_device
 from datagen.blender.log import BlenderLog, Progress, RenderError
 from datagen.blender.settings import apply_settings
-from datagen.scene import Scene
+from datagen.scene.scene import Scene
 
 __all__ = ["pass_path", "render_passes"]
 

@@ -16,8 +16,8 @@ from datagen.blender.devices import DeviceRequest, select_device
 from datagen.blender.log import BlenderLog, Progress, RenderError
 from datagen.blender.png import finish_picture
 from datagen.blender.settings import apply_settings, sampling_seed
-from datagen.scene import Scene
-from datagen.scene_file import scene_sha256
+from datagen.scene.scene import Scene
+from datagen.scene.scene_file import scene_sha256
 
 __all__ = ["Picture", "frame_path", "render_scene", "resume_key"]
 
@@ -106,7 +106,7 @@ def resume_key(scene: Scene) -> str:
     """Hash of all that decides the pictures: the scene, Blender's version and this package's source."""
     sha = hashlib.sha256(scene_sha256(scene).encode())
     sha.update(bpy.app.version_string.encode())
-    for source in sorted(Path(__file__).parent.glob("*.py")):
+    for source in sorted(Path(__file__).parent.rglob("*.py")):
         sha.update(source.read_bytes())
     return sha.hexdigest()
 

@@ -5,7 +5,7 @@ import hashlib
 import bpy
 
 from datagen.blender.devices import Device
-from datagen.scene import Scene
+from datagen.scene.scene import Scene
 
 __all__ = ["apply_settings", "sampling_seed"]
 

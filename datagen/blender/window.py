@@ -7,7 +7,7 @@ import bpy
 from datagen.blender.build import build_scene, show_frame, use_camera
 from datagen.blender.devices import select_device
 from datagen.blender.settings import apply_settings
-from datagen.scene import Scene
+from datagen.scene.scene import Scene
 
 __all__ = ["open_in_window"]
 

@@ -8,9 +8,9 @@ import numpy as np
 import OpenEXR
 from jaxtyping import Float32
 
-from datagen.blender.images import TextureError
-from datagen.blender.nodes import Graph
-from datagen.scene import Background
+from datagen.blender.shading.images import TextureError
+from datagen.blender.shading.nodes import Graph
+from datagen.scene.scene import Background
 
 __all__ = ["add_world", "hdri_path"]
 

@@ -4,7 +4,7 @@ import igl
 import numpy as np
 from jaxtyping import Float
 
-from datagen.objects.asset import ObjectAsset
+from datagen.objects.asset.object_asset import ObjectAsset
 
 __all__ = ["ObjectSurface", "verts_in_object"]
 

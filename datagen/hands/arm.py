@@ -55,7 +55,7 @@ class ArmStyle:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DressedHand:
-    """Hand, forearm and sleeve as one mesh; topology in the terms of `datagen.scene.HandSurface`.
+    """Hand, forearm and sleeve as one mesh; topology in the terms of `datagen.scene.scene.HandSurface`.
 
     The hand model's vertices come first. The forearm starts on its wrist ring; the cap that closes
     the bare model is left out.

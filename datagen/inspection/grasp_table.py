@@ -2,7 +2,7 @@
 
 from rich.table import Table
 
-from datagen.grasps.report import GraspReport, GraspReportRow
+from datagen.grasps.synthesis.report import GraspReport, GraspReportRow
 
 __all__ = ["grasp_table"]
 

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from shards.geometry import project_points, transform_points
-from shards.images import Masks
+from shards.storage.images import Masks
 
 __all__ = ["draw_labels"]
 

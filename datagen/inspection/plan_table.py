@@ -5,7 +5,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from datagen.plan import Plan
+from datagen.plan.plan import Plan
 from shards.splits import object_identity
 
 __all__ = ["plan_table"]

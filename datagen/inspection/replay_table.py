@@ -7,7 +7,7 @@ from jaxtyping import Float
 from rich import box
 from rich.table import Table
 
-from datagen.grasps.replay_report import ReplayOutcome
+from datagen.grasps.recorded.replay_report import ReplayOutcome
 from datagen.grasps.sequence import GraspSequence
 
 __all__ = ["replay_table"]

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from rich.table import Table
 
-from datagen.select_motions import Selection
-from datagen.selection import Decision, removed_by_rule
+from datagen.jobs.select_motions import Selection
+from datagen.plan.selection_rules import Decision, removed_by_rule
 
 __all__ = ["selection_lines", "selection_table"]
 

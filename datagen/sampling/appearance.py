@@ -14,8 +14,8 @@ from datagen.hands.skin import (
     open_skin_height_png,
     sample_skin_coefficients,
 )
-from datagen.scene import HandLook
-from shards.png import encode_png
+from datagen.scene.scene import HandLook
+from shards.storage.png import encode_png
 
 __all__ = ["AppearanceConfig", "sample_arm_style", "sample_betas", "sample_look"]
 

@@ -11,7 +11,7 @@ from datagen.sampling.errors import SamplingError
 from datagen.sampling.framing import Framing, Subject, frame_subject, image_drift_px, image_margin_px
 from datagen.sampling.trajectories import MotionLimits, PathStyle, sample_view_path
 from datagen.sampling.visibility import VisibilityProbe
-from datagen.scene import CameraPath
+from datagen.scene.scene import CameraPath
 from shards.geometry import camera_center
 
 __all__ = ["CameraFigures", "CamerasConfig", "PathStyles", "Surroundings", "sample_cameras"]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from datagen.scene import AreaLight, Background
+from datagen.scene.scene import AreaLight, Background
 
 __all__ = ["LightsConfig", "blackbody_rgb", "lamp_power_w", "sample_light"]
 

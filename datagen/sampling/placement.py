@@ -14,11 +14,11 @@ from scipy.spatial import ConvexHull, QhullError
 from datagen.grasps.sequence import GraspSequence, TableEdge
 from datagen.hands.arm import DressedHand, dressed_verts
 from datagen.hands.model import PosedHand, pose_hand
-from datagen.objects.mesh import ObjectMesh
+from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.sampling.clip import ClipWindow
 from datagen.sampling.errors import SamplingError
 from datagen.sampling.tables import TableConfig, sample_table
-from datagen.scene import Table
+from datagen.scene.scene import Table
 from shards.geometry import transform_points
 
 __all__ = ["Placement", "arm_end_verts", "object_mesh_hull", "place"]

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from datagen.raycast import TriangleCaster
+from datagen.geometry.raycast import TriangleCaster
 from datagen.sampling.framing import image_drift_px, image_margin_px
 from datagen.sampling.visibility import VisibilityProbe
-from datagen.scene import Scene
+from datagen.scene.scene import Scene
 from shards.geometry import transform_points
 
 __all__ = ["CameraReport", "frustum_report", "object_center_world"]

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.grasps.sequence import TableEdge
-from datagen.scene import Table
+from datagen.scene.scene import Table
 
 __all__ = ["TableConfig", "sample_table"]
 

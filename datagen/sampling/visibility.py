@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from datagen.raycast import TriangleCaster, pixel_rays, projected_window
+from datagen.geometry.raycast import TriangleCaster, pixel_rays, projected_window
 from shards.geometry import in_frustum, invert_transform, transform_points
 
 __all__ = ["SeenFigures", "VisibilityProbe"]

@@ -21,7 +21,7 @@ from torch.nn import functional
 from model.encoders.efficientnet import PYRAMID_CHANNELS, ImageNetPyramid
 from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
-from model.weights.safetensors_file import write_tensors
+from model.tensor_files.safetensors_file import write_tensors
 
 __all__ = [
     "N_JOINTS",

@@ -9,9 +9,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
+from model.data.batch import Batch
 from model.encoders.hand import HandNet, HandOutput
 from model.evaluation.overlap import intersection_over_union
-from model.sample import Batch
 from model.training.task import Evaluation, Losses
 
 __all__ = ["HandLossConfig", "HandTask", "hand_losses", "joint_positions"]

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from model.sample import ObjectSurface
+from model.data.batch import ObjectSurface
 from model.surface.mesh import SurfaceMesh
 
 __all__ = ["PointScore", "SampledMesh", "SurfaceScore", "point_score", "sample_mesh", "surface_score"]

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from model.config import TrainingConfig
-from model.motion_index import open_motions
-from model.stream_config import Cameras
+from model.data.config import Cameras
+from model.data.index import open_motions
+from model.recipes.config import TrainingConfig
 
 __all__ = ["held_out_clip"]
 

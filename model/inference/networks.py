@@ -9,16 +9,16 @@ from pathlib import Path
 
 import torch
 
-from model.config import TrainingConfig
 from model.encoders.hand import HandNet, packaged_hand_net
 from model.errors import ModelError
-from model.slat_config import SlatTrainingConfig, parse_any_config
+from model.recipes.components import load_stage_one, trained_parts
+from model.recipes.config import TrainingConfig
+from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, trained_slat_parts
+from model.recipes.slat_config import SlatTrainingConfig, parse_any_config
 from model.sparse_structure.stage_one import StageOneTask
 from model.structured_latent.flow_training import SlatFlowTask
 from model.training.checkpoint import latest_checkpoint, read_state
 from model.training.config import TrainerConfig
-from model.training.parts import load_stage_one, trained_parts
-from model.training.slat_parts import SLAT_PARTS, load_slat_flow, trained_slat_parts
 
 __all__ = [
     "Checkpoint",

@@ -12,7 +12,7 @@ from model.inference.crops import CloserCrop, FrameCrop, closer_crop, first_crop
 from model.inference.networks import Networks, StageTwoNetworks
 from model.inference.stage_clock import StageClock
 from model.inference.stages import run_stage_one, run_stage_two
-from model.surface.solid import SolidConfig, SolidSurface, solid_surface
+from model.surface.watertight_mesh import SolidConfig, SolidSurface, solid_surface
 from model.video.frame_choice import FrameChoice, choose_frames
 from model.video.frames import VideoFrame, VideoFrames
 from model.video.square_crop import SquareWindow

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from model.data.batch import OCCUPANCY_VOXELS
 from model.inference.networks import Networks
 from model.inference.reconstruction import Reconstruction
 from model.inference.scale import KnownScale
-from model.sample import OCCUPANCY_VOXELS
 from model.video.frame_choice import FrameChoice
 
 __all__ = ["RECORD", "write_record"]

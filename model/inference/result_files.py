@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import UInt8
 
+from model.data.batch import OCCUPANCY_VOXELS
 from model.inference.reconstruction import Reconstruction
-from model.sample import OCCUPANCY_VOXELS
 from model.surface.export import glb_bytes, voxel_mesh, voxels_ply
 from model.surface.mesh import SurfaceMesh
 from model.surface.rasteriser import Shading

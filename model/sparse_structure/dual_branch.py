@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from model.errors import ModelError
 from model.networks.transformer import layer_norm, run_block
-from model.sparse_structure.fusion import MaskContext, ViewFusion
+from model.networks.view_fusion import MaskContext, ViewFusion
 from model.sparse_structure.geometry_branch import GeometryBranch, GeometryBranchConfig
 from model.sparse_structure.mask_branch import MaskBranch, MaskBranchConfig
 

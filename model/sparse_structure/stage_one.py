@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from model.data.batch import Batch
 from model.encoders.aggregator import FeatureAggregator
 from model.encoders.cached import uncached
 from model.encoders.hand import HandEncoder, HandNet
@@ -27,12 +28,11 @@ from model.flow import (
     times_from_uniform,
     velocity_target,
 )
-from model.sample import Batch
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.prediction import Prediction
-from model.sparse_structure.stage_one_pictures import prediction_rows
+from model.sparse_structure.stage_one_images import prediction_rows
 from model.sparse_structure.vae import StructureVae, occupancy_from_logits
-from model.training.draws import normal_like, uniform
+from model.training.step_generators import normal_like, uniform
 from model.training.task import Evaluation, Losses, Measurements
 
 FIGURES = (

@@ -9,12 +9,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor, nn
 
+from model.data.batch import Batch
 from model.evaluation.overlap import intersection_over_union
-from model.sample import Batch
+from model.evaluation.voxel_image import voxel_picture
 from model.sparse_structure.vae import StructureVae, VaeConfig, occupancy_from_logits
-from model.training.draws import normal_like, uniform
+from model.training.step_generators import normal_like, uniform
 from model.training.task import Evaluation, Losses, Measurements
-from model.training.voxel_picture import voxel_picture
 
 __all__ = ["VaeTask", "turned"]
 

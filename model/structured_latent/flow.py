@@ -23,8 +23,8 @@ from model.networks.sparse.resampling import mean_pool, unpool
 from model.networks.sparse.tensor import SparseTensor
 from model.networks.sparse.transformer import ModulatedSparseCrossBlock
 from model.networks.transformer import initialise_head, initialise_transformer, layer_norm, run_block
-from model.structured_latent.latent import require_layout
-from model.structured_latent.trunk import embedded
+from model.structured_latent.vae.latent import require_layout
+from model.structured_latent.vae.trunk import embedded
 
 __all__ = ["SlatFlow", "SlatFlowConfig"]
 

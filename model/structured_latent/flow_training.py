@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from model.data.batch import Batch
 from model.encoders.protocol import FeatureEncoder
 from model.flow import (
     Guidance,
@@ -21,14 +22,13 @@ from model.flow import (
 )
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
-from model.sample import Batch
 from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, ScoredMesh, mean_scores, scored_mesh
-from model.structured_latent.object_input import ObjectInputs, object_surface
-from model.structured_latent.pictures import comparison
+from model.structured_latent.object_features.object_input import ObjectInputs, object_surface
 from model.structured_latent.prediction import SlatPrediction
+from model.structured_latent.surface_images import comparison
 from model.structured_latent.vae_training import SlatVae, normal_rows
 from model.structured_latent.view_conditioned import ViewCondition, ViewConditionedSlatFlow
-from model.training.draws import uniform
+from model.training.step_generators import uniform
 from model.training.task import Evaluation, Losses
 
 __all__ = ["LATENT", "SlatFlowTask", "SlatFlowTraining"]

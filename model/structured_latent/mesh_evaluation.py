@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.data.batch import ObjectSurface
 from model.errors import ModelError
 from model.evaluation.surface import SurfaceScore, surface_score
 from model.networks.sparse.tensor import SparseTensor
-from model.sample import ObjectSurface
 from model.structured_latent.prediction import decoded_fields
 from model.surface.extraction import ExtractionConfig, extract_surface
 from model.surface.mesh import MeshReport, SurfaceMesh, check_manifold

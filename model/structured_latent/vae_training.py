@@ -7,15 +7,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from model.data.batch import Batch
 from model.networks.sparse.grid import SparseGrid
-from model.sample import Batch
-from model.structured_latent.decoder import SurfaceDecoder
-from model.structured_latent.encoder import SlatEncoder
-from model.structured_latent.latent import SlatVaeConfig, sample
 from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, ScoredMesh, mean_scores, scored_mesh
-from model.structured_latent.object_input import ObjectInputs, object_surface
-from model.structured_latent.pictures import comparison
-from model.structured_latent.surface_loss import SurfaceLossConfig, surface_loss
+from model.structured_latent.object_features.object_input import ObjectInputs, object_surface
+from model.structured_latent.surface_images import comparison
+from model.structured_latent.vae.decoder import SurfaceDecoder
+from model.structured_latent.vae.encoder import SlatEncoder
+from model.structured_latent.vae.latent import SlatVaeConfig, sample
+from model.structured_latent.vae.surface_loss import SurfaceLossConfig, surface_loss
 from model.training.task import Evaluation, Losses
 
 __all__ = ["SlatVae", "SlatVaeTask", "normal_rows"]

@@ -10,9 +10,9 @@ from model.encoders.aggregator import FeatureAggregator
 from model.networks.embeddings import sincos_position_embedding
 from model.networks.sparse.tensor import SparseTensor
 from model.networks.transformer import layer_norm
-from model.sparse_structure.fusion import ViewFusion
+from model.networks.view_fusion import ViewFusion
 from model.structured_latent.flow import SlatFlow
-from model.structured_latent.latent import LatentNormalisation
+from model.structured_latent.vae.latent import LatentNormalisation
 
 __all__ = ["ViewCondition", "ViewConditionedSlatFlow", "ViewContext"]
 

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import UInt8
 from torch import nn
 
-from model.sample import Batch
+from model.data.batch import Batch
 
 __all__ = ["Evaluation", "Losses", "Measurements", "SharedValidation", "Task"]
 

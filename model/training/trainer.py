@@ -20,7 +20,7 @@ from accelerate.utils import broadcast_object_list
 from torch import nn
 from torch.utils.tensorboard import SummaryWriter
 
-from model.sample import Batch
+from model.data.batch import Batch
 from model.training.checkpoint import (
     TrainingState,
     delete_partial,
@@ -30,8 +30,8 @@ from model.training.checkpoint import (
 )
 from model.training.clock import Clock
 from model.training.config import OptimizerConfig, TrainerConfig
-from model.training.draws import sample_generators
 from model.training.ema import MovingAverage
+from model.training.step_generators import sample_generators
 from model.training.task import Evaluation, Losses, Task
 
 __all__ = ["BatchSource", "NonFiniteLossError", "PlacedBatch", "StepReport", "TrainingStopped", "train"]

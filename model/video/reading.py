@@ -8,7 +8,7 @@ from pathlib import Path
 from model.errors import ModelError
 from model.video.frame_choice import FrameChoice, choose_frames
 from model.video.frames import ReadLimits, VideoFrames
-from model.video.pictures import PICTURE_SUFFIXES, read_pictures
+from model.video.image_files import PICTURE_SUFFIXES, read_pictures
 from model.video.shard_clip import read_clip, shards_at
 from model.video.video_file import read_video
 

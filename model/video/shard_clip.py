@@ -6,7 +6,7 @@ from difflib import get_close_matches
 import numpy as np
 from jaxtyping import Float
 
-from model.crop import union_box
+from model.data.crop import union_box
 from model.errors import ModelError
 from model.video.frames import (
     ReadLimits,

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from model.crop import SquareCrop, crop_image
+from model.data.crop import SquareCrop, crop_image
 from model.errors import ModelError
 from model.video.frames import VideoFrame
 

@@ -13,7 +13,13 @@ from pathlib import Path
 from torch import Tensor, nn
 
 from model.errors import ModelError
-from model.weights.safetensors_file import KeyComparison, compare_keys, read_header, read_tensors, shapes_of
+from model.tensor_files.safetensors_file import (
+    KeyComparison,
+    compare_keys,
+    read_header,
+    read_tensors,
+    shapes_of,
+)
 from model.weights.weight_file import write_weight_file
 
 __all__ = [

@@ -19,15 +19,15 @@ from torch import Tensor
 
 from model.errors import ModelError
 from model.networks.sparse.convolution import pointwise_from_spconv
-from model.sparse_structure.fusion import ViewFusion
-from model.structured_latent.decoder import GaussianDecoder, SurfaceDecoder
-from model.structured_latent.encoder import SlatEncoder
+from model.networks.view_fusion import ViewFusion
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
-from model.structured_latent.gaussians import offset_perturbation
-from model.structured_latent.latent import LatentNormalisation, SlatVaeConfig
+from model.structured_latent.vae.decoder import GaussianDecoder, SurfaceDecoder
+from model.structured_latent.vae.encoder import SlatEncoder
+from model.structured_latent.vae.gaussians import offset_perturbation
+from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
+from model.tensor_files.safetensors_file import read_header
 from model.weights.published import PublishedNetwork, prefixed, published_shapes
-from model.weights.safetensors_file import read_header
 from model.weights.weight_file import load_weights
 
 __all__ = [

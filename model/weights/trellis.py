@@ -12,8 +12,8 @@ from model.errors import ModelError
 from model.networks.embeddings import sincos_position_embedding
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.vae import StructureDecoder, StructureEncoder, VaeConfig
+from model.tensor_files.safetensors_file import shapes_of
 from model.weights.published import PublishedNetwork, prefixed, published_shapes
-from model.weights.safetensors_file import shapes_of
 from model.weights.weight_file import GEOMETRY, VAE
 
 __all__ = ["stage_one_networks"]

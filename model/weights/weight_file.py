@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from model.errors import ModelError
 from model.sparse_structure.stage_one import StageOne
-from model.weights.safetensors_file import (
+from model.tensor_files.safetensors_file import (
     Header,
     compare_keys,
     read_header,

@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 import yaml
 
-from datagen.annotate import MotionGeometry, annotate_frame
+from datagen.annotation.annotate import MotionGeometry, annotate_frame
 from datagen.config import load_config
-from datagen.library import open_library
-from datagen.planning import plan_dataset
-from datagen.scene import Scene
-from datagen.scene_file import save_scene
-from datagen.timing import PhaseTimer
-from datagen.worker import RENDER_SCRIPT, Job, sampled_motion
+from datagen.jobs.plan_dataset import plan_dataset
+from datagen.jobs.render_motion import RENDER_SCRIPT, Job, sampled_motion
+from datagen.processes.phase_timer import PhaseTimer
+from datagen.scene.scene import Scene
+from datagen.scene.scene_file import save_scene
+from datagen.sources.objects import open_library
 from shards.reader import open_dataset
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -24,15 +24,15 @@ import pytest
 import torch
 from torch.utils.data import DataLoader, get_worker_info
 
-from model.clip_frames import ClipFrames
-from model.crop import crop_image, crop_masks, draw_crop, mirrored, union_box
-from model.data import ShardStream, StreamConfig, StreamState
-from model.data_order import RandomStream, SampleKey, random_stream, rank_batches
-from model.motion_index import FRAME_COLUMNS, MotionIndex, open_motions
-from model.sample import Batch, TrainingSample, stack_samples
-from model.sample_reader import choose_views
-from shards.images import encode_rgb_png
+from model.data.batch import Batch, TrainingSample, stack_samples
+from model.data.clip_frames import ClipFrames
+from model.data.crop import crop_image, crop_masks, draw_crop, mirrored, union_box
+from model.data.index import FRAME_COLUMNS, MotionIndex, open_motions
+from model.data.order import RandomStream, SampleKey, random_stream, rank_batches
+from model.data.reader import choose_views
+from model.data.stream import ShardStream, StreamConfig, StreamState
 from shards.schema import FrameRow
+from shards.storage.images import encode_rgb_png
 from tests.model.data.balls import VARIED, stream_config, write_balls
 
 SIZE_PX, CROP_PX, VIEWS, BATCH, WORKERS, PREFETCH = 256, 224, 4, 8, 2, 2

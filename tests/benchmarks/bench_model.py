@@ -17,19 +17,19 @@ import pytest
 import torch
 from accelerate import Accelerator
 
-from model.config import OwnHandEncoder, TrainingConfig, load_config
-from model.data import open_motions
+from model.data.batch import Batch
+from model.data.stream import open_motions
 from model.encoders.efficientnet import EfficientNetConfig, load_efficientnet
 from model.encoders.hand import HandEncoder, HandNet
 from model.encoders.protocol import FeatureEncoder
 from model.flow import Guidance
-from model.sample import Batch
+from model.recipes.config import OwnHandEncoder, TrainingConfig, load_config
+from model.recipes.frozen_encoders import aggregator_over, given_hand_encoder
+from model.recipes.shard_source import StreamSource
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
-from model.training.draws import sample_generators
-from model.training.frozen_encoders import aggregator_over, given_hand_encoder
-from model.training.source import StreamSource
+from model.training.step_generators import sample_generators
 from model.training.trainer import StepReport, train
 
 ROOT = Path(__file__).resolve().parents[2]

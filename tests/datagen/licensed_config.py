@@ -10,14 +10,14 @@ import trimesh
 import yaml
 
 from datagen.grasps.config import GraspConfig
-from datagen.grasps.synthesise import synthesise_grasp
+from datagen.grasps.synthesis.synthesise import synthesise_grasp
 from datagen.hands.model import HandModel, shape_hand
-from datagen.objects.asset import ConvexPart
-from datagen.objects.graspxl_objects import GraspXLObjects
-from datagen.objects.library import REFERENCE_READING
-from datagen.objects.preparation import REFERENCE_PREPARATION
-from datagen.objects.registration import REFERENCE_REGISTRATION
-from tests.datagen.grasps.official_files import recorded_arrays, still_arrays, write_sequence
+from datagen.objects.asset.object_asset import ConvexPart
+from datagen.objects.mesh.registration import REFERENCE_REGISTRATION
+from datagen.objects.stores.graspxl_objects import GraspXLObjects
+from datagen.objects.stores.library import REFERENCE_READING
+from datagen.objects.watertight.preparation import REFERENCE_PREPARATION
+from tests.datagen.grasps.recorded.official_files import recorded_arrays, still_arrays, write_sequence
 from tests.datagen.objects.official_files import (
     MODELS,
     objaverse_id,

@@ -6,7 +6,7 @@ from typing import Any
 import yaml
 from click.testing import CliRunner
 
-from model.cli import main
+from model.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
 TINY = ROOT / "configs" / "model" / "tiny.yaml"

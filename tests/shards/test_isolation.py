@@ -17,7 +17,7 @@ import sys
 for name in {FOREIGN!r}:
     sys.modules[name] = None
 from shards.errors import ImageError
-from shards.images import decode_rgb
+from shards.storage.images import decode_rgb
 from shards.reader import open_dataset
 from shards.verify import verify_dataset
 dataset = open_dataset(sys.argv[1])

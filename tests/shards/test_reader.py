@@ -11,10 +11,10 @@ from fsspec.implementations.local import LocalFileSystem
 
 from shards.columns import columns_of
 from shards.errors import DatasetNotFoundError, IncompleteShardError, MissingColumnError, SchemaVersionError
-from shards.images import decode_masks
 from shards.reader import open_dataset, open_shard
 from shards.records import check_schema_version, write_record
 from shards.schema import SCHEMA_VERSION, FrameRow
+from shards.storage.images import decode_masks
 from tests.shards.synthetic import PROVENANCE, stage_synthetic, synthetic_clip, synthetic_object
 
 

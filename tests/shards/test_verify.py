@@ -6,7 +6,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from shards.images import (
+from shards.reader import open_shard
+from shards.storage.images import (
     MASK_BITS,
     Masks,
     decode_geometry,
@@ -15,7 +16,6 @@ from shards.images import (
     encode_masks,
     encode_rgb_png,
 )
-from shards.reader import open_shard
 from shards.verify import verify_dataset, verify_shard
 from shards.writer import commit_shard, shard_dir, stage_motion
 from tests.shards.synthetic import PROVENANCE, SPLIT_RULE, synthetic_clip, synthetic_object

@@ -20,20 +20,20 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from datagen.objects.asset import Solid
+from datagen.objects.asset.object_asset import Solid
 from datagen.objects.builders.starter_selection import DROPPED, SELECTION, Look, Pick
-from datagen.objects.decimation import decimated_mesh
-from datagen.objects.export import mesh_to_glb
-from datagen.objects.gltf import read_gltf
-from datagen.objects.holdable import holdable_scale
-from datagen.objects.library import REFERENCE_READING
-from datagen.objects.mesh import Material
-from datagen.objects.orientation import outward_mesh
-from datagen.objects.pieces import mesh_pieces, sub_mesh
-from datagen.objects.preparation import REFERENCE_PREPARATION, cached_solid, solid_to_bytes
-from datagen.objects.reading import object_mesh
-from datagen.objects.sweethome3d import CatalogueEntry, find_libraries, read_catalogue, read_model
-from datagen.objects.texture_quality import measure_texture_quality
+from datagen.objects.formats.glb_export import mesh_to_glb
+from datagen.objects.formats.reading import object_mesh
+from datagen.objects.gltf.scene import read_gltf
+from datagen.objects.mesh.decimation import decimated_mesh
+from datagen.objects.mesh.graspable_size import holdable_scale
+from datagen.objects.mesh.object_mesh import Material
+from datagen.objects.mesh.outward_faces import outward_mesh
+from datagen.objects.mesh.submeshes import mesh_pieces, sub_mesh
+from datagen.objects.mesh.texture_quality import measure_texture_quality
+from datagen.objects.stores.library import REFERENCE_READING
+from datagen.objects.stores.sweethome3d import CatalogueEntry, find_libraries, read_catalogue, read_model
+from datagen.objects.watertight.preparation import REFERENCE_PREPARATION, cached_solid, solid_to_bytes
 
 LIBRARY = "BlendSwap-CC-0"
 SOURCE = f"sweethome3d-furniture 1.8-1, {LIBRARY}.sh3f"

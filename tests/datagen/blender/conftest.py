@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datagen.objects.mesh import Material, ObjectMesh
-from datagen.scene import (
+from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.scene.scene import (
     ARM_SKIN,
     HAND_SKIN,
     SLEEVE,
@@ -27,7 +27,7 @@ from datagen.scene import (
     Scene,
     Table,
 )
-from datagen.scene_file import save_scene
+from datagen.scene.scene_file import save_scene
 from shards.geometry import look_at
 
 ROOT = Path(__file__).parents[3]

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from datagen.blender.axes import blender_lens, world_from_blender_camera
-from datagen.table_mesh import inside_flat_top, table_from_world
+from datagen.scene.table_mesh import inside_flat_top, table_from_world
 from shards.geometry import (
     invert_transform,
     look_at,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datagen.objects.mesh import Material
-from datagen.scene import Background
-from datagen.scene_file import save_scene
+from datagen.objects.mesh.object_mesh import Material
+from datagen.scene.scene import Background
+from datagen.scene.scene_file import save_scene
 
 pytestmark = pytest.mark.blender
 SCRIPT = Path(__file__).parents[3] / "blender_scripts" / "render_scene.py"

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from datagen.blender.skin_relief import skin_relief, texel_size_m
-from datagen.blender.table_textures import draw_table
-from datagen.scene import HandSurface
+from datagen.blender.shading.skin_relief import skin_relief, texel_size_m
+from datagen.blender.shading.table_textures import draw_table
+from datagen.scene.scene import HandSurface
 
 
 @pytest.mark.parametrize("material", ["wood", "stone", "cloth", "laminate"])

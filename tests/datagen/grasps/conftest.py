@@ -8,9 +8,9 @@ import trimesh
 
 from datagen.grasps.config import GraspConfig
 from datagen.hands.model import ShapedHand, load_open_hand, shape_hand
-from datagen.objects.asset import ConvexPart, ObjectAsset, Solid
-from datagen.objects.mesh import Material, ObjectMesh
-from datagen.objects.texture_quality import TextureQuality
+from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, Solid
+from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.objects.mesh.texture_quality import TextureQuality
 
 CONFIG = GraspConfig(
     max_attempts=20,

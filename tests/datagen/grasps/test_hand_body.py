@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from datagen.grasps.hand_body import DIGITS, bone_transforms, build_hand_body, local_rotations
-from datagen.grasps.world import GraspWorld, WristTarget
+from datagen.grasps.synthesis.physics_world import GraspWorld, WristTarget
 from datagen.hands.model import load_open_hand, mirror_hand, pose_hand, shape_hand
 
 

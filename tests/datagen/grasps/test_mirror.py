@@ -8,9 +8,9 @@ import pytest
 from datagen.grasps.mirror import mirrored_sequence
 from datagen.grasps.sequence import TableEdge
 from datagen.hands.model import ShapedHand, mirror_hand, pose_hand, shape_hand
-from datagen.objects.mirror import mirrored_asset
+from datagen.objects.asset.mirror import mirrored_asset
 from shards.geometry import transform_points
-from tests.datagen.grasps.test_resample import spinning
+from tests.datagen.grasps.recorded.test_resample import spinning
 
 FLIP = np.array([-1.0, 1.0, 1.0])
 

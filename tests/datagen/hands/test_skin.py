@@ -21,7 +21,7 @@ from datagen.hands.skin import (
     open_skin_height_png,
     sample_skin_coefficients,
 )
-from shards.png import decode_png, encode_png
+from shards.storage.png import decode_png, encode_png
 
 N_DRAWS = 200
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from datagen.hands.model import DIGITS, HandModel, load_open_hand, mirror_hand, pose_hand, shape_hand
 from datagen.hands.skin import decode_skin, load_open_skin, open_nail_mask_png
 from datagen.hands.skin_transfer import transferred_corner_uv
-from shards.png import decode_png
+from shards.storage.png import decode_png
 from tests.datagen.hands.official_files import texture_lookup, uncapped
 
 BETAS = {"same": np.zeros(10), "other": np.array([1.0, -0.8, 0.9, -1.1, 0.7, 0.5, -0.6, 1.0, -0.4, 0.3])}

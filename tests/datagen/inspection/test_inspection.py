@@ -1,7 +1,6 @@
 """Inspection shows what the shard holds: numbers in the table, labels where the masks are."""
 
 import io
-import sys
 from pathlib import Path
 
 import cv2
@@ -10,15 +9,13 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from datagen.cli import main
+from datagen.cli.main import main
 from datagen.inspection.overlay import OBJECT_COLOR, draw_labels
 from datagen.inspection.sheet import contact_sheet
 from datagen.inspection.summary import shard_summary
-from shards.images import Masks
 from shards.reader import Shard, open_dataset
-
-sys.path.append(str(Path(__file__).resolve().parents[2] / "shards"))
-from synthetic import synthetic_dataset
+from shards.storage.images import Masks
+from tests.shards.synthetic import synthetic_dataset
 
 
 @pytest.fixture(scope="module")

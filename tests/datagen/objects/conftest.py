@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from datagen.objects.convex import ConvexConfig
-from datagen.objects.level_set import LevelSetConfig
-from datagen.objects.mesh import Material, ObjectMesh
-from datagen.objects.preparation import PreparationConfig
-from datagen.objects.solids import SolidConfig
+from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.objects.watertight.convex_parts import ConvexConfig
+from datagen.objects.watertight.level_set import LevelSetConfig
+from datagen.objects.watertight.preparation import PreparationConfig
+from datagen.objects.watertight.watertight_mesh import SolidConfig
 
 Surface = tuple[np.ndarray, np.ndarray]
 

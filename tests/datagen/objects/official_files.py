@@ -10,10 +10,10 @@ from pathlib import Path
 import fast_simplification
 import numpy as np
 
-from datagen.objects.asset import ObjectAsset
-from datagen.objects.export import mesh_to_glb
-from datagen.objects.holdable import scaled_mesh
-from datagen.objects.library import StarterPack
+from datagen.objects.asset.object_asset import ObjectAsset
+from datagen.objects.formats.glb_export import mesh_to_glb
+from datagen.objects.mesh.graspable_size import scaled_mesh
+from datagen.objects.stores.library import StarterPack
 
 # Small textured starter objects whose solids are their own surfaces.
 MODELS = ("starter/bread", "starter/rock_a", "starter/stone_lantern")

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from datagen.grasps.sequence import GraspQuality, GraspSequence, TableEdge
 from datagen.hands.model import ShapedHand, load_open_hand, pose_hand, shape_hand
 from datagen.hands.skin import SkinBasis
-from datagen.objects.asset import ConvexPart, ObjectAsset, Solid
-from datagen.objects.mesh import Material, ObjectMesh
-from datagen.objects.texture_quality import TextureQuality
+from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, Solid
+from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.objects.mesh.texture_quality import TextureQuality
 from datagen.sampling.config import SamplingConfig
 from shards.settings import settings_from_dict
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datagen.raycast import TriangleCaster
+from datagen.geometry.raycast import TriangleCaster
 from datagen.sampling.cameras import CamerasConfig, PathStyles, Surroundings, sample_cameras
 from datagen.sampling.errors import SamplingError
 from datagen.sampling.framing import Framing, Subject, frame_subject, image_drift_px

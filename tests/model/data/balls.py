@@ -5,10 +5,10 @@ from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
-from model.crop import Augmentation
-from model.data import ShardStream
-from model.sample import Batch
-from model.stream_config import StreamConfig
+from model.data.batch import Batch
+from model.data.config import StreamConfig
+from model.data.crop import Augmentation
+from model.data.stream import ShardStream
 from shards.schema import FrameRow, ObjectRow
 from shards.splits import Split, SplitRule, split_of_object
 from shards.writer import begin_dataset, commit_shard, stage_motion

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.crop import Augmentation, crop_image, crop_masks, draw_crop, mirrored, union_box
+from model.data.batch import TrainingSample
+from model.data.crop import Augmentation, crop_image, crop_masks, draw_crop, mirrored, union_box
 from model.errors import ModelError
-from model.sample import TrainingSample
 from shards.geometry import project_points, transform_points
-from shards.images import MASK_BITS, mask_box_px
+from shards.storage.images import MASK_BITS, mask_box_px
 from tests.model.data.voxel_scene import lopsided_occupancy, render_mask, voxel_centers_canonical
 
 OCCUPANCY = lopsided_occupancy()

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from model.crop import mirrored
-from model.data import ShardStream
-from model.data_order import SampleKey
+from model.data.crop import mirrored
+from model.data.order import SampleKey
+from model.data.reader import SampleReader
+from model.data.stream import ShardStream
 from model.errors import ModelError
-from model.sample_reader import SampleReader
 from shards.reader import open_dataset
 from tests.model.data.balls import VARIED, stream_config, take, write_balls
 

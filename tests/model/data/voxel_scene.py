@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from model.sample import OCCUPANCY_VOXELS
+from model.data.batch import OCCUPANCY_VOXELS
 from shards.geometry import project_points, transform_points
 
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)

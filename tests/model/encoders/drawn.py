@@ -3,7 +3,7 @@
 import torch
 from jaxtyping import Float
 
-from model.sample import Batch
+from model.data.batch import Batch
 
 
 def blob_picture(size: int, x: float, y: float, radius: float) -> Float[torch.Tensor, "3 size size"]:

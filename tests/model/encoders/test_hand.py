@@ -9,11 +9,11 @@ import torch
 from safetensors import safe_open
 from torch.nn import functional
 
+from model.data.batch import Batch
 from model.encoders.hand import HandEncoder, HandNet, HandNetConfig, HandOutput, load_hand_net, save_hand_net
 from model.encoders.hand_training import HandLossConfig, HandTask, hand_losses, joint_positions
 from model.encoders.protocol import FeatureEncoder
 from model.errors import ModelError
-from model.sample import Batch
 from model.training.task import Task
 from tests.model.encoders.drawn import blob_picture, hand_batch
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from model.data.batch import ObjectSurface
 from model.evaluation.surface import point_score, sample_mesh, surface_score
-from model.sample import ObjectSurface
 from model.surface.mesh import SurfaceMesh
 
 

@@ -8,8 +8,8 @@ import yaml
 from safetensors.torch import load_file, save_file
 
 from model.inference.networks import open_stage_one
+from model.recipes.components import load_stage_one
 from model.training.checkpoint import latest_checkpoint
-from model.training.parts import load_stage_one
 from tests.model.small_run import ROOT, forehoi, small_settings, write_config
 
 TINY_SLAT = ROOT / "configs" / "model" / "tiny_slat.yaml"

@@ -6,18 +6,18 @@ from dataclasses import replace
 import pytest
 import torch
 
+from model.data.batch import Batch
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.cached import CachedEncoder
 from model.encoders.hand import HandEncoder, HandNet, HandNetConfig
 from model.flow import Guidance, SamplerSettings, UniformTime
-from model.sample import Batch
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.geometry_branch import GeometryBranchConfig
 from model.sparse_structure.mask_branch import MaskBranchConfig
 from model.sparse_structure.stage_one import FIGURES, StageOne, StageOneConfig, StageOneTask, mask_targets
 from model.sparse_structure.vae import StructureVae, VaeConfig
 from model.sparse_structure.vae_training import turned
-from model.training.draws import sample_generators
+from model.training.step_generators import sample_generators
 from tests.model.encoders.mean_color import MeanColor
 
 

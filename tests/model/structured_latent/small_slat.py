@@ -7,7 +7,7 @@ from torch import nn
 
 from model.networks.sparse.tensor import SparseTensor
 from model.structured_latent.flow import SlatFlowConfig
-from model.structured_latent.latent import SlatVaeConfig
+from model.structured_latent.vae.latent import SlatVaeConfig
 
 VAE = SlatVaeConfig(
     feature_channels=10,

@@ -4,8 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from datagen.objects.fields import LearningTargets
-from model.sample import Batch, ObjectSurface, join_surfaces
+from datagen.objects.targets.learning_targets import LearningTargets
+from model.data.batch import Batch, ObjectSurface, join_surfaces
 from shards.schema import ObjectRow
 
 RESOLUTION = 64

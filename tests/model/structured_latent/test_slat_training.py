@@ -6,23 +6,23 @@ import numpy as np
 import pytest
 import torch
 
+from model.data.batch import Batch
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
 from model.flow import Guidance, SamplerSettings, UniformTime
 from model.networks.sparse.tensor import SparseTensor
-from model.sample import Batch
-from model.structured_latent.features import FEATURE_CHANNELS
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
 from model.structured_latent.flow_training import LATENT, SlatFlowTask, SlatFlowTraining
-from model.structured_latent.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, mean_scores, scored_mesh
-from model.structured_latent.object_input import ObjectInputs, object_surface
-from model.structured_latent.surface_loss import SurfaceLossConfig
+from model.structured_latent.object_features.object_input import ObjectInputs, object_surface
+from model.structured_latent.object_features.surface_features import FEATURE_CHANNELS
+from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
+from model.structured_latent.vae.surface_loss import SurfaceLossConfig
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask, normal_rows
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.surface.extraction import ExtractionConfig
 from model.surface.fields import CHANNELS, CORNERS
-from model.training.draws import sample_generators
+from model.training.step_generators import sample_generators
 from model.training.task import Task
 from tests.model.encoders.mean_color import MeanColor
 from tests.model.structured_latent.solids import ball, ball_distance, batch_of, plate, plate_distance, shell
@@ -146,7 +146,7 @@ def test_the_loss_of_a_sample_does_not_depend_on_its_neighbours(kind, batch, req
 
 def test_features_are_computed_once_per_object(vae_task, batch, monkeypatch):
     first = vae_task.inputs(batch)
-    monkeypatch.setattr("model.structured_latent.object_input.object_features", None)
+    monkeypatch.setattr("model.structured_latent.object_features.object_input.object_features", None)
     again = vae_task.inputs(batch)
     torch.testing.assert_close(again.features.features, first.features.features, rtol=0, atol=0)
 

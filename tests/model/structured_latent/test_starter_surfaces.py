@@ -8,13 +8,13 @@ import pytest
 import torch
 
 from datagen.config import load_config as load_datagen_config
-from datagen.objects.fields import TargetsConfig, learning_targets
-from datagen.objects.library import StarterPack
-from model.sample import ObjectSurface
-from model.slat_config import SlatTrainingConfig, SlatVaePart, load_any_config
-from model.structured_latent.object_input import ObjectInputs
+from datagen.objects.stores.library import StarterPack
+from datagen.objects.targets.learning_targets import TargetsConfig, learning_targets
+from model.data.batch import ObjectSurface
+from model.recipes.slat_config import SlatTrainingConfig, SlatVaePart, load_any_config
+from model.structured_latent.object_features.object_input import ObjectInputs
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask
-from model.training.draws import sample_generators
+from model.training.step_generators import sample_generators
 from tests.model.structured_latent.solids import RESOLUTION, batch_of, surface_of
 
 CONFIGS = Path(__file__).parents[3] / "configs"

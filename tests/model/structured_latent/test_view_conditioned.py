@@ -9,7 +9,7 @@ from torch import Tensor
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.networks.transformer import layer_norm
 from model.structured_latent.flow import SlatFlow
-from model.structured_latent.latent import LatentNormalisation
+from model.structured_latent.vae.latent import LatentNormalisation
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from tests.model.structured_latent.small_slat import FLOW, trained, voxels, without_gradient
 

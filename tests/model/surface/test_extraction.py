@@ -12,7 +12,7 @@ from model.surface.fields import SurfaceFields
 from model.surface.lattice import corner_lattice
 from model.surface.mesh import check_manifold
 from model.surface.simplification import simplify, without_small_components
-from model.surface.solid import SolidConfig, solid_surface
+from model.surface.watertight_mesh import SolidConfig, solid_surface
 from tests.model.surface.shells import ball, grid, noise_fields, shell_fields, torus, union
 
 SEALED = ExtractionConfig(seal=2)

@@ -13,9 +13,9 @@ import torch
 from accelerate import Accelerator
 from torch import nn
 
-from model.sample import Batch
+from model.data.batch import Batch
 from model.training.config import OptimizerConfig, TrainerConfig
-from model.training.draws import normal_like
+from model.training.step_generators import normal_like
 from model.training.task import Evaluation, Losses
 from model.training.trainer import PlacedBatch, StepReport, train
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from model.crop import union_box
+from model.data.crop import union_box
 from model.errors import ModelError
 from model.video.frames import ReadLimits
 from model.video.reading import read_frames

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from model.crop import Augmentation, crop_image, draw_crop
+from model.data.crop import Augmentation, crop_image, draw_crop
 from model.errors import ModelError
 from model.video.frames import VideoFrame
 from model.video.square_crop import (

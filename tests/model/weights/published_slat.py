@@ -7,10 +7,10 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from model.structured_latent.decoder import GaussianDecoder, SurfaceDecoder
-from model.structured_latent.encoder import SlatEncoder
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
-from model.structured_latent.latent import SlatVaeConfig
+from model.structured_latent.vae.decoder import GaussianDecoder, SurfaceDecoder
+from model.structured_latent.vae.encoder import SlatEncoder
+from model.structured_latent.vae.latent import SlatVaeConfig
 
 FLOW, ENCODER = "slat_flow_img_dit_L_64l8p2", "slat_enc_swin8_B_64l8"
 DECODER, GAUSSIAN = "slat_dec_mesh_swin8_B_64l8m256c", "slat_dec_gs_swin8_B_64l8gs32"

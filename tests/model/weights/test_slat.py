@@ -13,13 +13,13 @@ from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
 from model.networks.lora import add_lora, trainable_parameters
 from model.networks.sparse.tensor import SparseTensor
-from model.slat_config import SlatTrainingConfig, load_any_config
-from model.structured_latent.decoder import SurfaceDecoder
+from model.recipes.slat_config import SlatTrainingConfig, load_any_config
 from model.structured_latent.flow import SlatFlow
-from model.structured_latent.latent import LatentNormalisation, SlatVaeConfig
+from model.structured_latent.vae.decoder import SurfaceDecoder
+from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
+from model.tensor_files.safetensors_file import shapes_of
 from model.weights.published import ImportReport, find_published, import_networks, published_shapes
-from model.weights.safetensors_file import shapes_of
 from model.weights.slat import (
     GAUSSIANS,
     SLAT_ENCODER,

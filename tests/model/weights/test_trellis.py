@@ -7,11 +7,11 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from model.config import load_config
 from model.errors import ModelError
+from model.recipes.config import load_config
 from model.sparse_structure.dual_branch import DualBranchFlow
+from model.tensor_files.safetensors_file import shapes_of
 from model.weights.published import find_published, import_networks, published_shapes
-from model.weights.safetensors_file import shapes_of
 from model.weights.trellis import stage_one_networks
 from tests.model.weights.published import (
     CLASSES,

@@ -1,0 +1,22 @@
+"""FileMesh: a mesh as its file states it, before axes, unit and centre are settled."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from datagen.objects.mesh.object_mesh import Material
+
+__all__ = ["FileMesh"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileMesh:
+    """Triangles in the file's own axes and unit."""
+
+    verts_file: Float[np.ndarray, "vert 3"]
+    faces: Int[np.ndarray, "face 3"]
+    corner_uv: Float[np.ndarray, "face 3 2"]  # (0, 0) is the lower left of the image
+    face_material: Int[np.ndarray, "face"]
+    materials: tuple[Material, ...]
+    corner_colors: Float[np.ndarray, "face 3 rgb"] | None  # vertex colours, linear 0..1

@@ -1,0 +1,131 @@
+"""`forehoi weights`: published weights in, trained adapters out."""
+
+from pathlib import Path
+
+import click
+from rich.console import Console
+from rich.table import Table
+
+from model.cli.options import plain_errors
+from model.recipes.merging import export_run_adapter, merge_run
+from model.recipes.slat_config import SlatTrainingConfig, load_any_config
+from model.weights.published import ImportReport, import_networks
+from model.weights.slat import slat_networks
+from model.weights.trellis import stage_one_networks
+from model.weights.weight_file import StartConfig
+
+__all__ = ["weights"]
+
+
+@click.group()
+def weights() -> None:
+    """Published weights into a training, trained adapters out of it.
+
+    \b
+    Example:
+      forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
+      forehoi weights merge runs/paper --out weights/paper.safetensors
+    """
+
+
+@weights.command("import")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option(
+    "--config",
+    "config_path",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("configs/model/paper.yaml"),
+    show_default=True,
+    help="Configuration whose networks the weights are for.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("weights/trellis.safetensors"),
+    show_default=True,
+    help="Weight file to write; the list of all keys goes beside it, as .keys.json.",
+)
+@plain_errors
+def import_weights(source: Path, config_path: Path, out: Path) -> None:
+    """Convert published TRELLIS weights of the configuration's stage: SOURCE is a folder of them, or one file.
+
+    The file that is written is what `vae.weights` and `stage_one.start.weights`, or `slat_vae.weights` and
+    `slat_flow.start`, of a configuration name.
+
+    \b
+    Example:
+      forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
+      forehoi weights import TRELLIS-image-large --config configs/model/paper_slat.yaml --out weights/slat.safetensors
+    """
+    config = load_any_config(config_path)
+    if isinstance(config, SlatTrainingConfig):
+        networks = slat_networks(config.slat_flow.network, config.slat_vae.network)
+    else:
+        networks = stage_one_networks(config.stage_one.network, config.vae.network)
+    report = import_networks(source, networks, out)
+    console = Console()
+    console.print(_table(report))
+    for path in report.ignored:
+        console.print(f"not of this stage: {path}", soft_wrap=True)
+    for name in report.absent:
+        console.print(f"not in {source}: {name}", soft_wrap=True)
+    console.print(f"every key: {report.key_list}", soft_wrap=True)
+    console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+
+
+@weights.command()
+@click.argument("run", type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), required=True, help="Weight file to write."
+)
+@plain_errors
+def merge(run: Path, out: Path) -> None:
+    """Merge the adapters of a run into the weights that it started from; everything else it trained comes along.
+
+    RUN is of stage 1 or of stage 2.
+
+    \b
+    Example:
+      forehoi weights merge runs/paper --out weights/paper.safetensors
+    """
+    start = merge_run(run, out)
+    console = Console()
+    console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+    named = str(start)
+    if isinstance(start, StartConfig):
+        named = f"{{weights: {start.weights}, latent_scale: {start.latent_scale}}}"
+    console.print(f"to start from it: start: {named}", soft_wrap=True)
+
+
+@weights.command("export-adapter")
+@click.argument("run", type=click.Path(path_type=Path, file_okay=False))
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    required=True,
+    help="Folder to write, as peft does.",
+)
+@plain_errors
+def export(run: Path, out: Path) -> None:
+    """Write the adapter of a run for the peft library: adapter_config.json and adapter_model.safetensors.
+
+    It adapts the geometry branch, or the SLat flow, alone; what else was trained is in the run's checkpoint.
+
+    \b
+    Example:
+      forehoi weights export-adapter runs/paper --out adapters/paper
+    """
+    parameters = export_run_adapter(run, out)
+    Console().print(f"wrote {out} ({parameters:,} parameters)", soft_wrap=True)
+
+
+def _table(report: ImportReport) -> Table:
+    table = Table(title="keys of the published files", title_justify="left")
+    counts = ("used", "missing", "unused", "other shape", "new")
+    for column in ("network", "file", *counts):
+        table.add_column(column, justify="right" if column in counts else "left", overflow="fold")
+    for file in report.imported:
+        keys = file.keys
+        numbers = (keys.used, keys.missing, keys.unused, keys.mismatched, file.new)
+        table.add_row(file.network, file.path.name, *[str(len(names)) for names in numbers])
+    return table

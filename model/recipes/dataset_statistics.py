@@ -1,0 +1,54 @@
+"""What stage 1 must know of its training data when it is used: kept with the run, so that nobody needs the data."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from model.errors import ModelError
+from model.tensor_files.safetensors_file import write_tensors
+
+__all__ = ["TrainingFacts", "facts_of_run", "load_facts"]
+
+_FILE = "facts.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TrainingFacts:
+    """Measured once, before the first step."""
+
+    latent_scale: float  # latents are divided by it
+    mean_shape: Bool[Tensor, "64 64 64"]  # of the training objects
+
+
+def facts_of_run(folder: Path, measure: Callable[[], TrainingFacts]) -> TrainingFacts:
+    """Those of a run that goes on, or of one that begins: measured and written."""
+    if (folder / _FILE).exists():
+        return load_facts(folder)
+    facts = measure()
+    scale = torch.tensor(facts.latent_scale, dtype=torch.float64)
+    # Every rank measures, and writes, the same.
+    write_tensors(folder / _FILE, {"latent_scale": scale, "mean_shape": facts.mean_shape})
+    return facts
+
+
+def load_facts(folder: Path) -> TrainingFacts:
+    """ModelError when they are missing or broken."""
+    path = folder / _FILE
+    try:
+        tensors = load_file(path)
+        return TrainingFacts(
+            latent_scale=float(tensors["latent_scale"]), mean_shape=tensors["mean_shape"].bool()
+        )
+    except (OSError, SafetensorError, KeyError) as error:
+        raise ModelError(
+            path,
+            f"cannot be read ({' '.join(str(error).split())[:120]})",
+            expected="what a training of stage_one writes before its first step",
+            action=f"Train it first: forehoi train {folder.name}.",
+        ) from error

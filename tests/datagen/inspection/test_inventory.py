@@ -1,0 +1,83 @@
+"""`datagen assets` tells of every input whether it is there and sound, and never guesses."""
+
+import pytest
+from click.testing import CliRunner
+
+from datagen.cli.main import main
+from datagen.config import load_config
+from datagen.inspection.inventory import asset_states
+from tests.datagen.hands.official_files import write_html, write_mano
+from tests.datagen.licensed_config import ROOT, write_config, write_inputs
+
+OPEN = ("open hand", "open skins", "starter objects", "HDRIs")
+LICENSED = (
+    "MANO hand, right",
+    "MANO hand, left",
+    "HTML skin texture",
+    "GraspXL motions",
+    "GraspXL objects",
+    "Objaverse 1.0",
+)
+
+
+@pytest.fixture(autouse=True)
+def no_places(monkeypatch, tmp_path):
+    for variable in ("MANO_DIR", "HTML_DIR", "GRASPXL"):
+        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.setenv("OBJAVERSE", str(tmp_path / "no-store"))
+
+
+def states(path):
+    return {state.name: state for state in asset_states(load_config(path))}
+
+
+def test_without_licensed_files_the_open_ones_are_there_and_the_others_say_how_to_get_them():
+    found = states(ROOT / "configs" / "datagen" / "tiny.yaml")
+    assert set(found) == {*OPEN, "Sweet Home 3D models", *LICENSED}
+    assert {found[name].state for name in OPEN} == {"present"}
+    for name in LICENSED:
+        assert found[name].state == "missing"
+        assert found[name].how_to_get
+        assert found[name].licence
+        assert found[name].setting
+
+
+def test_what_is_there_is_opened_and_counted(tmp_path):
+    write_inputs(tmp_path)
+    write_mano(tmp_path / "hands")
+    write_html(tmp_path / "hands")
+    places = {"mano_dir": str(tmp_path / "hands"), "html_dir": str(tmp_path / "hands")}
+    found = states(write_config(tmp_path, lambda c: c["hand"].update(places)))
+    assert {found[name].state for name in LICENSED} == {"present"}
+    assert found["GraspXL motions"].version == "6 sequences of 3 objects in mano_dataset_1"
+    assert found["GraspXL objects"].version == "3 meshes"
+    assert found["Objaverse 1.0"].version == "3 objects"
+    assert "vertices, sha256" in found["MANO hand, left"].version
+    assert "coefficients, 1024 px" in found["HTML skin texture"].version
+
+
+def test_a_swapped_left_and_right_model_is_wrong_not_present(tmp_path):
+    paths = write_mano(tmp_path)
+    right, left = paths["right"].read_bytes(), paths["left"].read_bytes()
+    paths["right"].write_bytes(left)
+    paths["left"].write_bytes(right)
+    config = write_config(tmp_path, lambda c: c["hand"].update(mano_dir=str(tmp_path)))
+    for side in ("right", "left"):
+        state = states(config)[f"MANO hand, {side}"]
+        assert state.state == "wrong"
+        assert f"MANO_{side.upper()}.pkl" in state.problem
+
+
+def test_html_without_mano_says_what_it_lacks(tmp_path):
+    write_html(tmp_path)
+    config = write_config(tmp_path, lambda c: c["hand"].update(html_dir=str(tmp_path)))
+    state = states(config)["HTML skin texture"]
+    assert (state.state, "MANO_RIGHT.pkl" in state.problem) == ("wrong", True)
+
+
+def test_the_command_prints_one_table(tmp_path):
+    result = CliRunner().invoke(main, ["assets", "--config", str(ROOT / "configs/datagen/graspxl.yaml")])
+    assert result.exit_code == 0, result.output
+    for name in LICENSED:
+        assert name in result.output
+    assert "MANO_DIR" in result.output

@@ -1,0 +1,69 @@
+"""Children report by JSON lines, their failures surface, and they die with their parent."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from datagen.processes.child_process import ChildError, run_child
+
+
+def python(code: str) -> list[str]:
+    return [sys.executable, "-c", code]
+
+
+def test_events_arrive_and_other_output_goes_to_the_log(tmp_path):
+    events = []
+    code = (
+        "from datagen.child import emit; print('chatter'); emit(phase='render', done=1); emit(phase='done')"
+    )
+    run_child(python(code), log=tmp_path / "child.log", on_event=events.append)
+    assert events == [{"phase": "render", "done": 1}, {"phase": "done"}]
+    assert (tmp_path / "child.log").read_text() == "chatter\n"
+
+
+def test_failure_carries_status_and_end_of_log(tmp_path):
+    code = (
+        "import sys; [print(i, file=sys.stderr) for i in range(100)]; sys.exit('texture missing: wood.png')"
+    )
+    with pytest.raises(ChildError, match=r"texture missing: wood\.png") as caught:
+        run_child(python(code), log=tmp_path / "child.log", on_event=print)
+    assert caught.value.status == 1
+    assert "\n5\n" not in str(caught.value)  # the log is in its file, the message has its end
+
+
+def test_death_by_signal_is_named(tmp_path):
+    code = "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
+    with pytest.raises(ChildError, match="SIGSEGV"):
+        run_child(python(code), log=tmp_path / "child.log", on_event=print)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel call exists on Linux")
+def test_child_dies_when_its_parent_is_killed():
+    grandchild = "from datagen.child import die_with_parent; die_with_parent(); import time; time.sleep(60)"
+    code = (
+        "import subprocess, sys, time\n"
+        f"child = subprocess.Popen([sys.executable, '-c', {grandchild!r}])\n"
+        "print(child.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    parent = subprocess.Popen(python(code), stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    time.sleep(1.0)  # the grandchild imports and asks the kernel
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 5.0
+    while time.monotonic() < deadline and _is_running(pid):
+        time.sleep(0.05)
+    assert not _is_running(pid)
+
+
+def _is_running(pid: int) -> bool:
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except (FileNotFoundError, ProcessLookupError):
+        return False

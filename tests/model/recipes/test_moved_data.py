@@ -1,0 +1,67 @@
+"""A run goes on wherever its data lie and is used where they are not; other data are refused."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+
+from model.recipes.components import load_stage_one
+from model.recipes.config import load_config
+from tests.model.data.balls import write_balls
+from tests.model.small_run import fails, forehoi, small_settings, write_config
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory) -> Path:
+    """A dataset, the configuration of a run on it, and the run. Do not change it."""
+    root = tmp_path_factory.mktemp("moved")
+    write_balls(root / "here")
+    settings = small_settings(root / "here")
+    settings["hand_encoder"] = None
+    settings["encoders"]["hand"] = {"packaged_grid": 8}
+    config = write_config(root / "small.yaml", settings)
+    status, output = forehoi("train", config, "--out", root / "run")
+    assert status == 0, output
+    return root
+
+
+@pytest.fixture
+def elsewhere(root, tmp_path) -> tuple[Path, Path]:
+    """A copy of the run, and its configuration with data in another place, where there are none yet."""
+    run = Path(shutil.copytree(root / "run", tmp_path / "run"))
+    text = (root / "small.yaml").read_text().replace(str(root / "here"), str(tmp_path / "there"))
+    config = tmp_path / "small.yaml"
+    config.write_text(text)
+    return run, config
+
+
+def test_a_run_goes_on_with_data_that_were_moved(root, elsewhere, tmp_path):
+    run, config = elsewhere
+    shutil.copytree(root / "here", tmp_path / "there")
+    shutil.rmtree(run / "stage_one" / "checkpoints" / "step-00000002")  # as if stopped after the first step
+    status, output = forehoi("train", config, "--out", run)
+    assert status == 0, output
+    state = json.loads((run / "stage_one" / "checkpoints" / "step-00000002" / "state.json").read_text())
+    assert str(tmp_path / "there") in state["config_yaml"]
+    before = json.loads((root / "run" / "stage_one" / "figures.json").read_text())
+    assert json.loads((run / "stage_one" / "figures.json").read_text()) == before
+
+
+@pytest.mark.parametrize("part", ["vae", "stage_one"])
+def test_other_data_are_refused(elsewhere, tmp_path, part):
+    """Of the part itself, and of one that it stands on."""
+    run, config = elsewhere
+    write_balls(tmp_path / "there", n_frames=4)
+    shutil.rmtree(run / "stage_one")
+    line = fails("train", part, "--config", config, "--out", run)
+    assert "vae/checkpoints/step-00000002: was trained on other data" in line
+
+
+def test_a_run_is_used_where_its_data_are_not(elsewhere, tmp_path):
+    run, config = elsewhere
+    task = load_stage_one(load_config(config), run, torch.device("cpu"))
+    found = task.predict(torch.rand(1, 2, 3, 64, 64), torch.Generator().manual_seed(0))
+    assert found.occupancy.shape == (1, 64, 64, 64)
+    assert not (tmp_path / "there").exists()

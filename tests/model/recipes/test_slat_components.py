@@ -1,0 +1,193 @@
+"""Stage 2 by its configuration on a small dataset: both parts, exact resume, and what can go wrong."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from accelerate import Accelerator
+from safetensors.torch import load_file
+
+from model.data.stream import ShardStream
+from model.errors import ModelError
+from model.networks.lora import LoraSettings
+from model.recipes.config import TrainingConfig, as_yaml
+from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, train_slat_part
+from model.recipes.slat_config import SlatTrainingConfig, load_any_config, parse_any_config
+from model.structured_latent.flow import SlatFlow
+from model.structured_latent.vae.latent import LatentNormalisation
+from model.training.checkpoint import latest_checkpoint
+from model.weights.slat import SLAT_FLOW
+from model.weights.weight_file import write_weight_file
+from shards.settings import SettingsError
+from tests.model.data.balls import write_balls
+
+FOLDER = Path(__file__).resolve().parents[3] / "configs" / "model"
+NAMES = sorted(path.stem for path in FOLDER.glob("*_slat.yaml"))
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Path:
+    return write_balls(tmp_path_factory.mktemp("balls"))
+
+
+@pytest.fixture(scope="module")
+def config(dataset) -> SlatTrainingConfig:
+    """tiny_slat.yaml, cut down to seconds."""
+    settings = yaml.safe_load((FOLDER / "tiny_slat.yaml").read_text())
+    settings["data"] |= {
+        "datasets": [str(dataset)],
+        "workers": 0,
+        "samples_per_motion": 4,
+        "held_out_cameras": 0.4,
+    }
+    settings["validation"] |= {"views": 2, "batch_size": 1, "batches": 1}
+    settings["encoders"]["image"] = {"image_size": 64, "grid": 8}
+    settings["meshes"]["samples"] = 2000
+    settings["slat_vae"]["network"] |= {"channels": 8, "blocks": 1}
+    settings["slat_flow"]["network"] |= {
+        "channels": 12,
+        "heads": 1,
+        "blocks": 1,
+        "io_channels": [4, 8],
+        "condition_channels": 12,
+    }
+    settings["slat_flow"]["sampler"]["steps"] = 2
+    for part in SLAT_PARTS:
+        recipe = settings[part]["recipe"]
+        recipe |= {"batch_size": 1, "views": [1, 2], "image_size": 32}
+        recipe["trainer"] |= {"steps": 2, "checkpoint_every": 1, "validate_every": 2, "log_every": 1}
+    return parse_any_config(yaml.safe_dump(settings), where="small")
+
+
+def train(name: str, config: SlatTrainingConfig, folder: Path) -> tuple[dict[str, float], list[int]]:
+    steps: list[int] = []
+    figures = train_slat_part(
+        name,
+        config,
+        folder,
+        accelerator=Accelerator(cpu=True),
+        report=lambda report: steps.append(report.step),
+    )
+    return figures, steps
+
+
+@pytest.fixture(scope="module")
+def finished(config, tmp_path_factory) -> Path:
+    """The run of both parts. Do not change it."""
+    folder = tmp_path_factory.mktemp("run")
+    for name in SLAT_PARTS:
+        figures, steps = train(name, config, folder)
+        assert steps == [1, 2]
+        assert "f_5mm" in figures
+    return folder
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    newest = latest_checkpoint(folder / "checkpoints")
+    assert newest is not None
+    return load_file(newest / "weights.safetensors")
+
+
+def test_a_finished_run_trains_nothing_and_gives_its_figures(config, finished):
+    before = weights(finished / "slat_flow")
+    figures, steps = train("slat_flow", config, finished)
+    assert steps == []
+    assert "mean_latent_f_5mm" in figures
+    after = weights(finished / "slat_flow")
+    assert all(torch.equal(before[name], after[name]) for name in before)
+
+
+@pytest.mark.parametrize("name", SLAT_PARTS)
+def test_a_run_that_was_stopped_ends_where_one_without_a_stop_does(name, config, finished, tmp_path):
+    (tmp_path / "slat_vae").symlink_to(finished / "slat_vae") if name == "slat_flow" else None
+    _stop_after_one_step(name, config, tmp_path)
+    _, steps = train(name, config, tmp_path)
+    assert steps == [2]
+    ours, theirs = weights(tmp_path / name), weights(finished / name)
+    assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
+
+
+def _stop_after_one_step(name: str, config: SlatTrainingConfig, folder: Path) -> None:
+    class StopError(Exception):
+        pass
+
+    def stop(report) -> None:
+        if report.step == 2:
+            raise StopError
+
+    with pytest.raises(StopError):
+        train_slat_part(name, config, folder, accelerator=Accelerator(cpu=True), report=stop)
+
+
+def test_the_trained_flow_predicts_from_pictures(config, finished):
+    task = load_slat_flow(config, finished, torch.device("cpu"))
+    stream = ShardStream(replace(config.data, views=(2, 2)))
+    batch = next(iter(stream))
+    prediction = task.predict(batch.images, batch.occupancy, torch.Generator().manual_seed(0))
+    assert prediction.fields(0).resolution == 64
+    assert torch.isfinite(prediction.decoded.features).all()
+
+
+def test_a_flow_with_adapters_is_used_with_the_weights_that_it_started_from(config, finished, tmp_path):
+    published = SlatFlow(config.slat_flow.network)
+    start = tmp_path / "start.safetensors"
+    tensors = {f"{SLAT_FLOW}{name}": value for name, value in published.state_dict().items()}
+    normalisation = LatentNormalisation.identity(config.slat_flow.network.latent_channels).state_dict()
+    tensors |= {f"stage_two.normalisation.{name}": value for name, value in normalisation.items()}
+    write_weight_file(start, tensors, sources={})
+    part = replace(config.slat_flow, start=start, lora=LoraSettings(rank=2, alpha=4, dropout=0.0))
+    adapted = replace(config, slat_flow=part)
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "slat_vae").symlink_to(finished / "slat_vae")
+    _, steps = train("slat_flow", adapted, tmp_path / "run")
+    assert steps == [1, 2]
+    flow = load_slat_flow(adapted, tmp_path / "run", torch.device("cpu")).network.flow
+    held = flow.state_dict()
+    assert any("lora_A" in name for name in held)
+    name = "blocks.0.mlp.mlp.0.weight"
+    torch.testing.assert_close(held[name], published.state_dict()[name], rtol=0, atol=0)
+
+
+def test_the_flow_without_its_vae_says_what_to_train(config, tmp_path):
+    with pytest.raises(ModelError, match="forehoi train slat_vae"):
+        train("slat_flow", config, tmp_path)
+
+
+def test_the_vae_of_another_configuration_is_refused(config, finished):
+    other = replace(config, slat_vae=replace(config.slat_vae, loss=replace(config.slat_vae.loss, kl=0.5)))
+    with pytest.raises(ModelError, match="another configuration"):
+        train("slat_flow", other, finished)
+
+
+def test_the_hand_encoder_of_stage_one_is_refused(config, finished):
+    text = as_yaml(config).replace("packaged_grid", "own_grid")
+    with pytest.raises(ModelError, match="packaged_grid"):
+        load_slat_flow(parse_any_config(text, where="own"), finished, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_published_configurations_are_complete(name):
+    config = load_any_config(FOLDER / f"{name}.yaml")
+    assert isinstance(config, SlatTrainingConfig)
+    assert config.name == name
+    assert parse_any_config(as_yaml(config), where="again") == config
+
+
+def test_files_of_stage_one_are_read_as_such():
+    assert isinstance(load_any_config(FOLDER / "tiny.yaml"), TrainingConfig)
+
+
+def test_contradictions_name_both_sides(config):
+    text = as_yaml(config)
+    with pytest.raises(SettingsError, match="feature_channels is 10"):
+        parse_any_config(text.replace("feature_channels: 16", "feature_channels: 10"), where="file")
+    bad = yaml.safe_load(text)
+    bad["slat_flow"]["network"]["latent_channels"] = 4
+    with pytest.raises(SettingsError, match="takes 4 channels"):
+        parse_any_config(yaml.safe_dump(bad), where="file")
+    with pytest.raises(SettingsError, match="slat_flo"):
+        parse_any_config(text.replace("slat_flow:", "slat_flo:"), where="file")
+    with pytest.raises(ModelError, match="does not exist"):
+        load_any_config(FOLDER / "nothing.yaml")

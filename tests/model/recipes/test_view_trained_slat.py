@@ -1,0 +1,81 @@
+"""Stage 2 trained on image features of the clean objects, with the open image encoder: both parts, end to end."""
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from accelerate import Accelerator
+
+from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, train_slat_part
+from model.recipes.slat_config import SlatTrainingConfig, parse_any_config
+from tests.model.small_run import ROOT
+from tests.model.structured_latent.object_features.textured_ball import write_textured_balls
+
+STEPS = {"slat_vae": 24, "slat_flow": 3}
+
+
+def small_config(dataset: Path, cache: Path | None) -> SlatTrainingConfig:
+    """tiny_slat.yaml with features of views, cut down to seconds; flips are on."""
+    settings = yaml.safe_load((ROOT / "configs" / "model" / "tiny_slat.yaml").read_text())
+    settings["data"] |= {"datasets": [str(dataset)], "workers": 0, "held_out_cameras": 0.4}
+    settings["validation"] |= {"views": 1, "batch_size": 1, "batches": 1}
+    settings["encoders"] |= {"image": {"image_size": 64, "grid": 8}, "hand": {"packaged_grid": 8}}
+    settings["meshes"]["samples"] = 500
+    settings["slat_vae"]["network"] |= {"feature_channels": 568, "channels": 12, "blocks": 1}
+    settings["slat_vae"]["loss"]["kl"] = 0.0001  # else the first steps mostly shrink the latents
+    settings["slat_vae"]["features"] = {
+        "views": 4,
+        "image_size": 64,
+        "supersampling": 1,
+        "cache": None if cache is None else str(cache),
+    }
+    flow = {"channels": 12, "heads": 1, "blocks": 1, "io_channels": [4, 8], "condition_channels": 12}
+    settings["slat_flow"]["network"] |= flow
+    for part in SLAT_PARTS:
+        recipe = settings[part]["recipe"]
+        recipe |= {"batch_size": 1, "views": [1, 1], "image_size": 32}
+        steps = STEPS[part]
+        recipe["trainer"] |= {"steps": steps, "checkpoint_every": steps, "validate_every": steps}
+        recipe["trainer"]["log_every"] = 1
+        recipe["optimizer"]["warmup_steps"] = 2
+    config = parse_any_config(yaml.safe_dump(settings), where="small")
+    assert isinstance(config, SlatTrainingConfig)
+    return config
+
+
+def trained(name: str, config: SlatTrainingConfig, folder: Path) -> list[float]:
+    """Losses of its steps."""
+    losses: list[float] = []
+    train_slat_part(
+        name,
+        config,
+        folder,
+        accelerator=Accelerator(cpu=True),
+        report=lambda report: losses.append(report.losses["loss"]),
+    )
+    return losses
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("views")
+    write_textured_balls(root / "balls")
+    return root
+
+
+def test_the_vae_learns_and_the_flow_trains_on_it(place: Path) -> None:
+    config = small_config(place / "balls", place / "features")
+    losses = trained("slat_vae", config, place / "run")
+    assert all(map(math.isfinite, losses))
+    assert sum(losses[-4:]) < 0.7 * sum(losses[:4])
+    assert all(map(math.isfinite, trained("slat_flow", config, place / "run")))
+    # Where the features are kept decides nothing: a finished run is found without its cache, and needs no views.
+    elsewhere = small_config(place / "balls", None)
+    assert trained("slat_vae", elsewhere, place / "run") == []
+    task = load_slat_flow(elsewhere, place / "run", torch.device("cpu"))
+    occupancy = torch.zeros(1, 64, 64, 64, dtype=torch.bool)
+    occupancy[0, 20:24, 20:24, 20:24] = True
+    prediction = task.predict(torch.rand(1, 2, 3, 32, 32), occupancy, torch.Generator().manual_seed(0))
+    assert torch.isfinite(prediction.decoded.features).all()
