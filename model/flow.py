@@ -53,51 +53,51 @@ def _per_sample(t: Tensor, like: Tensor) -> Tensor:
 
 
 def interpolate(
-    clean: Float[Tensor, "batch *shape"], noise: Float[Tensor, "batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, "batch *shape"]:
+    clean: Float[Tensor, " batch *shape"], noise: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
+) -> Float[Tensor, " batch *shape"]:
     """x_t = (1 - t) clean + t noise, one t per sample."""
     time = _per_sample(t, clean)
     return (1 - time) * clean + time * noise
 
 
 def velocity_target(
-    clean: Float[Tensor, "batch *shape"], noise: Float[Tensor, "batch *shape"]
-) -> Float[Tensor, "batch *shape"]:
+    clean: Float[Tensor, " batch *shape"], noise: Float[Tensor, " batch *shape"]
+) -> Float[Tensor, " batch *shape"]:
     """dx_t/dt = noise - clean: what the network regresses (Eq. 2: epsilon - x_0)."""
     return noise - clean
 
 
 def clean_from_velocity(
-    x_t: Float[Tensor, "batch *shape"], velocity: Float[Tensor, "batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, "batch *shape"]:
+    x_t: Float[Tensor, " batch *shape"], velocity: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
+) -> Float[Tensor, " batch *shape"]:
     """clean = x_t - t velocity."""
     return x_t - _per_sample(t, x_t) * velocity
 
 
 def noise_from_velocity(
-    x_t: Float[Tensor, "batch *shape"], velocity: Float[Tensor, "batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, "batch *shape"]:
+    x_t: Float[Tensor, " batch *shape"], velocity: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
+) -> Float[Tensor, " batch *shape"]:
     """noise = x_t + (1 - t) velocity."""
     return x_t + (1 - _per_sample(t, x_t)) * velocity
 
 
 def velocity_from_clean(
-    x_t: Float[Tensor, "batch *shape"], clean: Float[Tensor, "batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, "batch *shape"]:
+    x_t: Float[Tensor, " batch *shape"], clean: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
+) -> Float[Tensor, " batch *shape"]:
     """velocity = (x_t - clean) / t; not finite at t = 0, where x_t carries no noise."""
     return (x_t - clean) / _per_sample(t, x_t)
 
 
 def velocity_from_noise(
-    x_t: Float[Tensor, "batch *shape"], noise: Float[Tensor, "batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, "batch *shape"]:
+    x_t: Float[Tensor, " batch *shape"], noise: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
+) -> Float[Tensor, " batch *shape"]:
     """velocity = (noise - x_t) / (1 - t); not finite at t = 1, where x_t carries no signal."""
     return (noise - x_t) / (1 - _per_sample(t, x_t))
 
 
 def preconditioned_velocity(
-    x_t: Float[Tensor, "batch *shape"], output: Float[Tensor, "batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, "batch *shape"]:
+    x_t: Float[Tensor, " batch *shape"], output: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
+) -> Float[Tensor, " batch *shape"]:
     """The best linear guess of the velocity from x_t for clean tensors of unit variance, plus scaled output.
 
     With S = (1 - t)^2 + t^2: velocity = (2 t - 1) / S x_t + output / sqrt(S). The output's target has unit
@@ -113,10 +113,10 @@ _MIN_TIME = 1e-3
 
 
 def binary_velocity(
-    x_t: Float[Tensor, "batch *shape"],
-    half_log_odds: Float[Tensor, "batch *shape"],
+    x_t: Float[Tensor, " batch *shape"],
+    half_log_odds: Float[Tensor, " batch *shape"],
     t: Float[Tensor, " batch"],
-) -> Float[Tensor, "batch *shape"]:
+) -> Float[Tensor, " batch *shape"]:
     """Velocity of a tensor that is -1 or +1 when clean, from half the log-odds of +1 apart from its own noise.
 
     The noisy value is itself evidence with half log-odds (1 - t) x_t / t^2, so by Bayes' rule
@@ -177,10 +177,10 @@ def _squared_error(predicted: Tensor, target: Tensor) -> Tensor:
 
 def joint_cfm_loss(
     *,
-    predicted_masks: Float[Tensor, "batch *mask"],
-    target_masks: Float[Tensor, "batch *mask"],
-    predicted_geometry: Float[Tensor, "batch *latent"],
-    target_geometry: Float[Tensor, "batch *latent"],
+    predicted_masks: Float[Tensor, " batch *mask"],
+    target_masks: Float[Tensor, " batch *mask"],
+    predicted_geometry: Float[Tensor, " batch *latent"],
+    target_geometry: Float[Tensor, " batch *latent"],
     beta: float,
 ) -> JointLoss:
     """L = L_2D + beta L_3D (Eq. 2): mean squared error of the velocities, both taken at the same t.

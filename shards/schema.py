@@ -116,7 +116,7 @@ class ObjectRow:
         frame="canonical",
         meaning="Where the signed distance is sampled.",
     )
-    sdf_values: Float[np.ndarray, "sample"] = column(
+    sdf_values: Float[np.ndarray, " sample"] = column(
         "float32", "sample", unit="canonical", frame="canonical", meaning="Signed distance, negative inside."
     )
     texture_resolution_px: int = column(
@@ -175,13 +175,13 @@ class ClipRow:
     flat_hand_mean: bool = column(
         "bool", meaning="True: hand_pose is the full rotation; false: an offset from the model's mean pose."
     )
-    betas: Float[np.ndarray, "beta"] = column(
+    betas: Float[np.ndarray, " beta"] = column(
         "float32", "beta", meaning="Shape coefficients of the hand model."
     )
     skin_model: str = column(
         "string", meaning="Skin texture model: open, or html with its variant (html model_sr)."
     )
-    skin_coefficients: Float[np.ndarray, "coefficient"] = column(
+    skin_coefficients: Float[np.ndarray, " coefficient"] = column(
         "float32", "coefficient", meaning="Coefficients of the skin texture model."
     )
     skin_roughness: float = column("float32", meaning="Surface roughness of the skin, 0..1.")
@@ -234,8 +234,10 @@ class ClipRow:
     light_target_world: Float[np.ndarray, "light 3"] = column(
         "float32", "light", 3, unit="m", frame="world", meaning="Points the lights face."
     )
-    light_power_w: Float[np.ndarray, "light"] = column("float32", "light", unit="W", meaning="Radiant power.")
-    light_size_m: Float[np.ndarray, "light"] = column(
+    light_power_w: Float[np.ndarray, " light"] = column(
+        "float32", "light", unit="W", meaning="Radiant power."
+    )
+    light_size_m: Float[np.ndarray, " light"] = column(
         "float32", "light", unit="m", meaning="Side of the square."
     )
     light_color_rgb: Float[np.ndarray, "light 3"] = column(

@@ -119,7 +119,7 @@ def annotate_frame(geometry: MotionGeometry, frame: int) -> tuple[FrameGeometry,
     return tuple(_annotate(geometry, layers, camera, frame) for camera in geometry.scene.cameras)
 
 
-def hand_object_distances(scene: Scene) -> Float[np.ndarray, "frame"]:
+def hand_object_distances(scene: Scene) -> Float[np.ndarray, " frame"]:
     """Smallest signed distance of the hand's own vertices to the drawn object mesh, metres, per frame.
 
     Negative inside; the sign is the winding number of the nearest candidates, so a mesh of open
@@ -141,7 +141,7 @@ def hand_object_distances(scene: Scene) -> Float[np.ndarray, "frame"]:
 
 def hand_and_arm(
     surface: HandSurface,
-) -> tuple[tuple[Int[np.ndarray, "used"], Int[np.ndarray, "face 3"]], ...]:
+) -> tuple[tuple[Int[np.ndarray, " used"], Int[np.ndarray, "face 3"]], ...]:
     """(vertices used, faces into them) of the hand's skin, then of forearm and sleeve."""
     parts = []
     for chosen in (surface.face_part == HAND_SKIN, surface.face_part != HAND_SKIN):
@@ -239,7 +239,7 @@ def _annotate(
 
 def _flat_top_depth(
     table: Table, T_world_from_cam: Float[np.ndarray, "4 4"], K: Float[np.ndarray, "3 3"], window: PixelWindow
-) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, "pixel"], Int[np.ndarray, "pixel"]]:
+) -> tuple[Float[np.ndarray, "height width"], Int[np.ndarray, " pixel"], Int[np.ndarray, " pixel"]]:
     """Depth of the flat top (inf beside it); row and column of the pixels that may see the slab's border.
 
     From above, a ray that goes down meets the plane of the top before any other part of the slab.

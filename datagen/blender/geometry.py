@@ -20,7 +20,7 @@ def add_mesh(
     verts: Float[np.ndarray, "vert 3"],
     faces: Int[np.ndarray, "face 3"],
     corner_uv: Float[np.ndarray, "face 3 2"],
-    face_material: Int[np.ndarray, "face"],
+    face_material: Int[np.ndarray, " face"],
     materials: list[bpy.types.Material],
 ) -> bpy.types.Object:
     """A smooth-shaded triangle mesh in the current scene; `face_material` indexes `materials`."""
@@ -79,7 +79,7 @@ def set_pose(drawn: bpy.types.Object, T_world_from_obj: Float[np.ndarray, "4 4"]
 
 
 def add_vertex_attribute(
-    drawn: bpy.types.Object, name: str, values: Float[np.ndarray, "vert 3"] | Float[np.ndarray, "vert"]
+    drawn: bpy.types.Object, name: str, values: Float[np.ndarray, "vert 3"] | Float[np.ndarray, " vert"]
 ) -> None:
     """A named attribute that shaders read: a vector per vertex, or one number per vertex."""
     kind, field = ("FLOAT_VECTOR", "vector") if values.ndim == 2 else ("FLOAT", "value")

@@ -79,9 +79,9 @@ class TriangleCaster:
         self,
         center: Float[np.ndarray, "3"],
         rays: Float[np.ndarray, "hit 3"],
-        triangle: Int[np.ndarray, "hit"],
-        embree_depth: Float[np.ndarray, "hit"],
-    ) -> Float[np.ndarray, "hit"]:
+        triangle: Int[np.ndarray, " hit"],
+        embree_depth: Float[np.ndarray, " hit"],
+    ) -> Float[np.ndarray, " hit"]:
         normal = self.normals[triangle]
         height = self._offsets[triangle] - normal @ center
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -92,7 +92,7 @@ class TriangleCaster:
     def unit_normals_cam(
         self,
         T_mesh_from_cam: Float[np.ndarray, "4 4"],
-        triangle: Int[np.ndarray, "hit"],
+        triangle: Int[np.ndarray, " hit"],
         rays_cam: Float[np.ndarray, "hit 3"],
     ) -> Float[np.ndarray, "hit 3"]:
         """Geometric unit normals in the camera frame, turned against the ray; 0 without area."""
@@ -125,8 +125,8 @@ def projected_window(
 def pixel_rays(
     K: Float[np.ndarray, "3 3"],
     window: PixelWindow,
-    row: Int[np.ndarray, "pixel"],
-    column: Int[np.ndarray, "pixel"],
+    row: Int[np.ndarray, " pixel"],
+    column: Int[np.ndarray, " pixel"],
 ) -> Float[np.ndarray, "pixel 3"]:
     """Rays through the centres of some pixels of a window, camera frame, z = 1."""
     rays = np.ones((len(row), 3))

@@ -11,7 +11,7 @@ __all__ = ["TOUCHING_M", "digit_distances", "digit_of_vertex", "digits_touching"
 TOUCHING_M = 0.005  # a digit whose skin comes this near the surface touches it
 
 
-def digit_of_vertex(model: HandModel) -> Int[np.ndarray, "vert"]:
+def digit_of_vertex(model: HandModel) -> Int[np.ndarray, " vert"]:
     """Number in DIGITS of the digit that moves each vertex most; -1 on palm and wrist."""
     digit_of_joint = np.array([-1, *(DIGITS.index(name[:-1]) for name in JOINT_NAMES[1:])])
     return digit_of_joint[model.weights.argmax(axis=1)]

@@ -18,7 +18,7 @@ class ObjectSurface:
         self.faces = np.ascontiguousarray(source.faces, dtype=np.int64)
         self.low, self.high = self.verts.min(0), self.verts.max(0)
 
-    def depth(self, points_obj: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
+    def depth(self, points_obj: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, " point"]:
         """How deep each point lies inside (m); 0 outside. Generalised winding number for the sign."""
         depth = np.zeros(len(points_obj))
         near = ((points_obj > self.low) & (points_obj < self.high)).all(1)
@@ -32,9 +32,9 @@ class ObjectSurface:
             depth[near] = np.maximum(-signed, 0.0)
         return depth
 
-    def distance(self, points_obj: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, "point"]:
+    def distance(self, points_obj: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, " point"]:
         """Signed distance of each point (m), negative inside."""
-        signed: Float[np.ndarray, "point"] = igl.signed_distance(
+        signed: Float[np.ndarray, " point"] = igl.signed_distance(
             np.ascontiguousarray(points_obj),
             self.verts,
             self.faces,

@@ -54,7 +54,7 @@ class GraspSequence:
     side: Literal["right", "left"]
     fps: float
     flat_hand_mean: bool
-    betas: Float[np.ndarray, "beta"]
+    betas: Float[np.ndarray, " beta"]
     hand_orientation_world: Float[np.ndarray, "frame 3"]
     hand_pose: Float[np.ndarray, "frame 45"]
     hand_translation_world: Float[np.ndarray, "frame 3"]

@@ -64,7 +64,7 @@ class DressedHand:
     shaped: ShapedHand
     faces: Int[np.ndarray, "face 3"]
     corner_uv: Float[np.ndarray, "face 3 2"]
-    face_part: Int[np.ndarray, "face"]
+    face_part: Int[np.ndarray, " face"]
     n_hand_verts: int
     extra_verts_wrist: Float[np.ndarray, "extra 3"]  # relative to the rest wrist joint, rest axes
 
@@ -77,10 +77,10 @@ class _ArmAxis:
     axis: Float[np.ndarray, "3"]  # away from the hand
     side: Float[np.ndarray, "3"]  # towards the thumb
     back: Float[np.ndarray, "3"]
-    ring_angle: Float[np.ndarray, "column"]
-    ring_radius: Float[np.ndarray, "column"]
-    ring_slant: Float[np.ndarray, "column"]  # of the ring along the axis, metres
-    ring_flare: Float[np.ndarray, "column"]  # change of the hand's radius per metre towards the arm
+    ring_angle: Float[np.ndarray, " column"]
+    ring_radius: Float[np.ndarray, " column"]
+    ring_slant: Float[np.ndarray, " column"]  # of the ring along the axis, metres
+    ring_flare: Float[np.ndarray, " column"]  # change of the hand's radius per metre towards the arm
     half_widths: Float[np.ndarray, "2"]  # of the wrist: side, back
 
 
@@ -123,7 +123,7 @@ def dressed_verts(dressed: DressedHand, posed: PosedHand) -> Float[np.ndarray, "
     return np.concatenate([posed.verts_world, extra_world], axis=1)
 
 
-def wrist_cap(faces: Int[np.ndarray, "face 3"], loop: Int[np.ndarray, "loop"]) -> Bool[np.ndarray, "face"]:
+def wrist_cap(faces: Int[np.ndarray, "face 3"], loop: Int[np.ndarray, " loop"]) -> Bool[np.ndarray, " face"]:
     """Faces beyond the wrist ring: the smaller of the parts into which the ring cuts the mesh, if it does."""
     ring_edges = np.sort(np.stack([loop, np.roll(loop, -1)], axis=1), axis=1)
     on_ring = {tuple(edge) for edge in ring_edges.tolist()}
@@ -168,7 +168,7 @@ def _arm_axis(shaped: ShapedHand, hand_faces: Int[np.ndarray, "hand_face 3"]) ->
 
 def _mean_neighbour(
     vert: int,
-    loop: Int[np.ndarray, "loop"],
+    loop: Int[np.ndarray, " loop"],
     faces: Int[np.ndarray, "face 3"],
     values: Float[np.ndarray, "vert 2"],
 ) -> Float[np.ndarray, "2"]:

@@ -12,7 +12,7 @@ def continued_uv(
     *,
     arm_faces: Int[np.ndarray, "face 3"],
     arm_ring: Float[np.ndarray, "vert 3"],
-    arm_distance_m: Float[np.ndarray, "vert"],
+    arm_distance_m: Float[np.ndarray, " vert"],
     axis: Float[np.ndarray, "3"],
     hand_triangles: Float[np.ndarray, "hand_face 3 3"],
     hand_corner_uv: Float[np.ndarray, "hand_face 3 2"],

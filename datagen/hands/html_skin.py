@@ -157,7 +157,7 @@ def _uv_on(
 
 def _sorted_faces(
     faces: Int[np.ndarray, "face 3"],
-) -> tuple[Int[np.ndarray, "face"], Int[np.ndarray, "face 3"], Int[np.ndarray, "face 3"]]:
+) -> tuple[Int[np.ndarray, " face"], Int[np.ndarray, "face 3"], Int[np.ndarray, "face 3"]]:
     """Rows and corners in the order that sorts the vertices of each face, then the faces; the vertices."""
     corner = np.argsort(faces, axis=1)
     vertices = np.take_along_axis(faces, corner, axis=1)

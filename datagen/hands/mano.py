@@ -229,7 +229,7 @@ def _tip_ids(
     return np.array(tips, dtype=np.int64)
 
 
-def _wrist_loop(path: Path, side: Side, faces: Int[np.ndarray, "face 3"], n: int) -> Int[np.ndarray, "loop"]:
+def _wrist_loop(path: Path, side: Side, faces: Int[np.ndarray, "face 3"], n: int) -> Int[np.ndarray, " loop"]:
     """The border of the mesh, running with the edges of the faces that lie on it."""
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     code = edges[:, 0] * n + edges[:, 1]

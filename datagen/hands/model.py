@@ -52,7 +52,7 @@ class HandModel:
     hands_mean: Float[np.ndarray, "45"]
     tip_ids: Int[np.ndarray, "5"]  # thumb, index, middle, ring, pinky
     corner_uv: Float[np.ndarray, "face 3 2"]  # (0, 0) is the lower left of the texture
-    wrist_loop: Int[np.ndarray, "loop"]  # border of the wrist, in order around it
+    wrist_loop: Int[np.ndarray, " loop"]  # border of the wrist, in order around it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -60,7 +60,7 @@ class ShapedHand:
     """A model with shape coefficients applied. Rest frame, metres."""
 
     model: HandModel
-    betas: Float[np.ndarray, "beta"]
+    betas: Float[np.ndarray, " beta"]
     verts_rest: Float[np.ndarray, "vert 3"]
     joints_rest: Float[np.ndarray, "16 3"]
 
@@ -74,7 +74,7 @@ class PosedHand:
     joints_world: Float[np.ndarray, "frame 21 3"]  # 16 joints, then the five tips
 
 
-def shape_hand(model: HandModel, betas: Float[np.ndarray, "beta"]) -> ShapedHand:
+def shape_hand(model: HandModel, betas: Float[np.ndarray, " beta"]) -> ShapedHand:
     """Apply shape coefficients. ValueError when there are more of them than the model has."""
     n = model.shapedirs.shape[2]
     if len(betas) > n:

@@ -38,16 +38,16 @@ class SkinBasis:
 
     name: str
     size: int
-    mean: Float[np.ndarray, "value"]
+    mean: Float[np.ndarray, " value"]
     basis: Float[np.ndarray, "value coefficient"]
-    index_map: Int[np.ndarray, "value"]
+    index_map: Int[np.ndarray, " value"]
     axes: tuple[str, ...]  # what each coefficient changes; "" when unknown
     anchors: Float[np.ndarray, "skin coefficient"]
-    fill: Int[np.ndarray, "texel"] | None = None
+    fill: Int[np.ndarray, " texel"] | None = None
 
 
 def decode_skin(
-    basis: SkinBasis, coefficients: Float[np.ndarray, "coefficient"]
+    basis: SkinBasis, coefficients: Float[np.ndarray, " coefficient"]
 ) -> UInt8[np.ndarray, "row column 3"]:
     """sRGB texture, row 0 at the top. ValueError unless there is one coefficient per column of the basis."""
     n = basis.basis.shape[1]
@@ -61,7 +61,7 @@ def decode_skin(
     return np.ascontiguousarray(flat.reshape(3, basis.size, basis.size).transpose(2, 1, 0))
 
 
-def nearest_texels(index_map: Int[np.ndarray, "value"], size: int) -> Int[np.ndarray, "texel"]:
+def nearest_texels(index_map: Int[np.ndarray, " value"], size: int) -> Int[np.ndarray, " texel"]:
     """For each texel of the flattened image the nearest one that `index_map` writes, in its channel.
 
     Filtering at the border of an island then mixes skin with skin, not with the black around it.
@@ -75,7 +75,7 @@ def nearest_texels(index_map: Int[np.ndarray, "value"], size: int) -> Int[np.nda
     return np.stack(channels).reshape(-1)
 
 
-def sample_skin_coefficients(rng: np.random.Generator, basis: SkinBasis) -> Float[np.ndarray, "coefficient"]:
+def sample_skin_coefficients(rng: np.random.Generator, basis: SkinBasis) -> Float[np.ndarray, " coefficient"]:
     """A plausible skin, tones spread evenly from the darkest to the lightest anchor.
 
     Two anchors from opposite halves of the tone axis (coefficient 0) are mixed, up to 8 % beyond
@@ -103,7 +103,7 @@ def load_open_skin() -> SkinBasis:
     # (row, column, channel) of the picture to HTML's (channel, column, row)
     order = np.flatnonzero(np.broadcast_to(inside.T, (3, size, size)))
 
-    def values(name: str) -> Float[np.ndarray, "value"]:
+    def values(name: str) -> Float[np.ndarray, " value"]:
         return _image(name, size).transpose(2, 1, 0).reshape(-1)[order].astype(np.float32)
 
     columns = [values(axis["file"]) * axis["step"] + axis["low"] for axis in table["axes"]]

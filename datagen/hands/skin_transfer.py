@@ -84,7 +84,7 @@ def _bone_similarity(
     return np.column_stack([scale * rotation, goal[0] - scale * rotation @ bone[0]])
 
 
-def _face_part(model: HandModel, faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, "face"]:
+def _face_part(model: HandModel, faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, " face"]:
     """What moves each face most: 0 the palm, 1 .. 5 the digits."""
     weights = model.weights[faces].sum(axis=1)
     digits = [
@@ -95,10 +95,10 @@ def _face_part(model: HandModel, faces: Int[np.ndarray, "face 3"]) -> Int[np.nda
 
 def _face_below(
     triangles: Float[np.ndarray, "face 3 3"],
-    part: Int[np.ndarray, "face"],
+    part: Int[np.ndarray, " face"],
     wanted: Float[np.ndarray, "target 3 3"],
-    wanted_part: Int[np.ndarray, "target"],
-) -> Int[np.ndarray, "target"]:
+    wanted_part: Int[np.ndarray, " target"],
+) -> Int[np.ndarray, " target"]:
     """The source face on which each target face lies: near, facing the same way, of no other digit."""
     features, wanted_features = _features(triangles), _features(wanted)
     found = np.empty(len(wanted), dtype=np.int64)
@@ -152,7 +152,7 @@ def _connected(counts: csr_array) -> csr_array:
 def _closest_points(
     triangles: Float[np.ndarray, "face 3 3"],
     around: Int[np.ndarray, "face around"],
-    start: Int[np.ndarray, "target"],
+    start: Int[np.ndarray, " target"],
     wanted: Float[np.ndarray, "target 3 3"],
 ) -> tuple[Int[np.ndarray, "target 3"], Float[np.ndarray, "target 3 3"]]:
     """Source face and barycentric coordinates of the point next to each target corner."""

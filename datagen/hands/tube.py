@@ -20,7 +20,7 @@ def tube_faces(n_rows: int, n_columns: int) -> Int[np.ndarray, "face 3"]:
     )
 
 
-def close_end(row: Int[np.ndarray, "column"], apex: int, *, at_start: bool) -> Int[np.ndarray, "column 3"]:
+def close_end(row: Int[np.ndarray, " column"], apex: int, *, at_start: bool) -> Int[np.ndarray, "column 3"]:
     """Fan from the first or last row of a tube to its apex, facing as `tube_faces` does."""
     following = np.roll(row, -1)
     pair = [row, following] if at_start else [following, row]
@@ -28,7 +28,7 @@ def close_end(row: Int[np.ndarray, "column"], apex: int, *, at_start: bool) -> I
 
 
 def tube_corner_uv(
-    faces: Int[np.ndarray, "face 3"], n_columns: int, v_of_row: Float[np.ndarray, "row"]
+    faces: Int[np.ndarray, "face 3"], n_columns: int, v_of_row: Float[np.ndarray, " row"]
 ) -> Float[np.ndarray, "face 3 2"]:
     """u once around, v as given per row; vertices past the last row are apexes (start, end)."""
     n_rows = len(v_of_row)

@@ -40,7 +40,7 @@ class AppearanceConfig:
     sleeve_weave: tuple[float, float]
 
 
-def sample_betas(rng: np.random.Generator, config: AppearanceConfig) -> Float[np.ndarray, "beta"]:
+def sample_betas(rng: np.random.Generator, config: AppearanceConfig) -> Float[np.ndarray, " beta"]:
     """Shape coefficients of the hand model: normal, cut off at two standard deviations."""
     return config.betas_std * np.clip(rng.normal(size=config.n_betas), -MAX_BETA, MAX_BETA)
 

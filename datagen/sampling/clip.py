@@ -30,7 +30,7 @@ class ClipConfig:
 class ClipWindow:
     """Frames of the sequence that are drawn."""
 
-    frames: Int[np.ndarray, "frame"]  # indices into the sequence
+    frames: Int[np.ndarray, " frame"]  # indices into the sequence
     fps: float
     supported: bool  # the object lies on a table in at least one drawn frame
     movement_rad: float  # `object_movement`

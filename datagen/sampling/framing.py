@@ -133,7 +133,7 @@ def _camera_poses(
     return T
 
 
-def _upper_envelope(values: Float[np.ndarray, "frame"], reach: int) -> Float[np.ndarray, "frame"]:
+def _upper_envelope(values: Float[np.ndarray, " frame"], reach: int) -> Float[np.ndarray, " frame"]:
     """A smooth curve nowhere below `values`: the average of running maxima that all cover the frame."""
     window = 2 * reach + 1
     kernel = np.hanning(window + 2)[1:-1]

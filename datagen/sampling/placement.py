@@ -85,7 +85,7 @@ def object_mesh_hull(mesh: ObjectMesh) -> Float[np.ndarray, "hull 3"]:
 
 def arm_end_verts(
     hand_verts_world: Float[np.ndarray, "vert 3"], n_hand_verts: int, wrist_world: Float[np.ndarray, "3"]
-) -> Int[np.ndarray, "end"]:
+) -> Int[np.ndarray, " end"]:
     """Vertices of the closed end of forearm or sleeve: the farthest ones along the arm."""
     arm = hand_verts_world[n_hand_verts:] - wrist_world
     axis = arm.mean(axis=0) / np.linalg.norm(arm.mean(axis=0))

@@ -32,12 +32,12 @@ class SampledMotion:
 
     scene: Scene
     sequence: GraspSequence  # where it comes from, whole
-    sequence_frames: Int[np.ndarray, "frame"]  # which of its frames are drawn
+    sequence_frames: Int[np.ndarray, " frame"]  # which of its frames are drawn
     grasp_frame: int  # first drawn frame in which the hand carries the object; n_frames: never
     hand_orientation_world: Float[np.ndarray, "frame 3"]
     hand_pose: Float[np.ndarray, "frame 45"]
     hand_translation_world: Float[np.ndarray, "frame 3"]
-    betas: Float[np.ndarray, "beta"]
+    betas: Float[np.ndarray, " beta"]
     skin_model: str
     joints_world: Float[np.ndarray, "frame 21 3"]
     contact_force_n: Float[np.ndarray, "frame 5"]

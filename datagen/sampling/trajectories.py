@@ -47,10 +47,10 @@ class MotionLimits:
 class ViewPath:
     """One camera's direction over time. `slack` >= 1 multiplies the distance that just frames the subject."""
 
-    azimuth_rad: Float[np.ndarray, "frame"]
-    elevation_rad: Float[np.ndarray, "frame"]
-    roll_rad: Float[np.ndarray, "frame"]
-    slack: Float[np.ndarray, "frame"]
+    azimuth_rad: Float[np.ndarray, " frame"]
+    elevation_rad: Float[np.ndarray, " frame"]
+    roll_rad: Float[np.ndarray, " frame"]
+    slack: Float[np.ndarray, " frame"]
     aim_world: Float[np.ndarray, "frame 3"]  # metres added to the target
     fov_rad: float
     floor_distance_m: float
@@ -123,7 +123,7 @@ def band_limited(
     return np.sum(amplitude * np.sin(2.0 * np.pi * frequency * np.arange(n_frames) / fps + phase), axis=1)
 
 
-def _ease(n_frames: int, softness: float) -> Float[np.ndarray, "frame"]:
+def _ease(n_frames: int, softness: float) -> Float[np.ndarray, " frame"]:
     """0 -> 1 at constant speed (softness 0) or starting and ending slowly (softness 1)."""
     u = np.linspace(0.0, 1.0, n_frames)
     return (1.0 - softness) * u + softness * u * u * (3.0 - 2.0 * u)

@@ -17,9 +17,9 @@ SAME_SURFACE_M = 0.002
 class SeenFigures:
     """Per frame."""
 
-    visible_fraction: Float[np.ndarray, "frame"]  # 0..1; 0 when no ray meets the object
-    arm_end_seen: Bool[np.ndarray, "frame"]  # the end of the drawn arm is in the picture
-    object_size_px: Float[np.ndarray, "frame"]  # square root of its amodal area, full-size pixels
+    visible_fraction: Float[np.ndarray, " frame"]  # 0..1; 0 when no ray meets the object
+    arm_end_seen: Bool[np.ndarray, " frame"]  # the end of the drawn arm is in the picture
+    object_size_px: Float[np.ndarray, " frame"]  # square root of its amodal area, full-size pixels
 
 
 class VisibilityProbe:
@@ -33,7 +33,7 @@ class VisibilityProbe:
         T_world_from_obj: Float[np.ndarray, "frame 4 4"],
         hand_verts_world: Float[np.ndarray, "frame vert 3"],
         hand_faces: Int[np.ndarray, "face 3"],
-        arm_end: Int[np.ndarray, "end"],  # vertices of the arm's end among the hand's
+        arm_end: Int[np.ndarray, " end"],  # vertices of the arm's end among the hand's
         rays_across: int,
     ) -> None:
         self._object = object_caster
@@ -77,7 +77,7 @@ class VisibilityProbe:
         K: Float[np.ndarray, "3 3"],
         image_size: tuple[int, int],
         T_cam_from_world: Float[np.ndarray, "frame 4 4"],
-    ) -> Bool[np.ndarray, "frame"]:
+    ) -> Bool[np.ndarray, " frame"]:
         seen = np.zeros(len(self._hands), dtype=bool)
         ends_cam = transform_points(T_cam_from_world, self._arm_end_world)
         inside = in_frustum(ends_cam, K, image_size)

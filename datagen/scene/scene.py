@@ -80,7 +80,7 @@ class HandSurface:
 
     faces: Int[np.ndarray, "face 3"]
     corner_uv: Float[np.ndarray, "face 3 2"]
-    face_part: Int[np.ndarray, "face"]  # HAND_SKIN, ARM_SKIN or SLEEVE
+    face_part: Int[np.ndarray, " face"]  # HAND_SKIN, ARM_SKIN or SLEEVE
     n_hand_verts: int
 
 
@@ -89,7 +89,7 @@ class HandLook:
     """Appearance of hand, forearm and sleeve."""
 
     skin_png: bytes  # sRGB colour texture for HAND_SKIN faces (and the forearm's mean colour)
-    skin_coefficients: Float[np.ndarray, "coefficient"]
+    skin_coefficients: Float[np.ndarray, " coefficient"]
     skin_roughness: float
     subsurface: float  # weight 0..1
     bump: float  # strength of fine skin relief, 0..1

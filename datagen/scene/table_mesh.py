@@ -79,7 +79,7 @@ def inside_flat_top(
 
 def _inside_convex(
     outline: Float[np.ndarray, "corner 2"], points: Float[np.ndarray, "point 2"]
-) -> Bool[np.ndarray, "point"]:
+) -> Bool[np.ndarray, " point"]:
     side = np.roll(outline, -1, axis=0) - outline
     normal = np.stack([-side[:, 1], side[:, 0]], axis=-1)  # points inward
     return np.all(points @ normal.T >= np.sum(normal * outline, axis=-1), axis=-1)

@@ -34,7 +34,7 @@ class ObjectSurface:
     normals: Float32[np.ndarray, "surface 3"]  # outward, unit
     colors: UInt8[np.ndarray, "surface 3"]  # sRGB base colour, unshaded
     sdf_points: Float32[np.ndarray, "sample 3"]
-    sdf_values: Float32[np.ndarray, "sample"]  # negative inside
+    sdf_values: Float32[np.ndarray, " sample"]  # negative inside
     object_scale_m: float  # metres per canonical unit
     is_mirrored: bool = False  # x -> -x of the object that the shard holds
 
@@ -47,7 +47,7 @@ class TrainingSample:
     object_uid: str
     split: str
     clip_ids: tuple[str, ...]  # one per view
-    frame_indices: Int[np.ndarray, "view"]
+    frame_indices: Int[np.ndarray, " view"]
     images: Float32[np.ndarray, "view 3 size size"]  # sRGB, 0..1; 0 outside the rendered image
     object_amodal: Bool[np.ndarray, "view size size"]
     object_visible: Bool[np.ndarray, "view size size"]
@@ -68,7 +68,7 @@ class SurfaceBatch:
     normals: Float[torch.Tensor, "surface 3"]
     colors: UInt8[torch.Tensor, "surface 3"]
     sdf_points: Float[torch.Tensor, "sample 3"]
-    sdf_values: Float[torch.Tensor, "sample"]
+    sdf_values: Float[torch.Tensor, " sample"]
     point_counts: tuple[int, ...]  # rows of `points` of each sample
     sdf_counts: tuple[int, ...]
     object_uids: tuple[str, ...]
@@ -111,7 +111,7 @@ class Batch:
     T_cam_from_canonical: Float[torch.Tensor, "batch view 4 4"]
     occupancy: Bool[torch.Tensor, "batch 64 64 64"]
     joints_px: Float[torch.Tensor, "batch view 21 2"]  # NaN behind the camera
-    is_right: Bool[torch.Tensor, "batch"]
+    is_right: Bool[torch.Tensor, " batch"]
     ids: tuple[str, ...]  # "motion_id:epoch:position", one per sample
     surface: SurfaceBatch | None = None  # read only where StreamConfig.surface asks for it
 

@@ -51,7 +51,7 @@ def random_stream(
     return np.random.default_rng(np.random.SeedSequence([*words, attempt] if attempt else words))
 
 
-def epoch_order(n_samples: int, *, seed: int, epoch: int, shuffle: bool) -> Int[np.ndarray, "sample"]:
+def epoch_order(n_samples: int, *, seed: int, epoch: int, shuffle: bool) -> Int[np.ndarray, " sample"]:
     """Sample at each position of the epoch."""
     if not shuffle:
         return np.arange(n_samples)

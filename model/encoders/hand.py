@@ -76,7 +76,7 @@ class HandOutput:
     """The held object, as far as visible: told from other things by the hand on it."""
     joint_logits: Float[Tensor, "view 21 cell cell"]
     """Where each joint is, hidden or not; a softmax over the cells makes a distribution of it."""
-    right_logit: Float[Tensor, "view"]
+    right_logit: Float[Tensor, " view"]
 
 
 class _Residual(nn.Module):

@@ -38,7 +38,7 @@ def hand_losses(
     output: HandOutput,
     batch: Batch,
     config: HandLossConfig,
-) -> dict[str, Float[Tensor, "batch"]]:
+) -> dict[str, Float[Tensor, " batch"]]:
     """Losses of each sample: "mask" (cross-entropy + Dice, of hand and arm), "object" (the same of
     the visible part of the held object), "joints" (KL divergence of the
     predicted from a Gaussian distribution, over the joints inside the picture), "side" (cross-entropy)."""
@@ -166,7 +166,7 @@ def _covered(mask: Bool[Tensor, "batch view size size"], cells: int) -> Float[Te
     return functional.adaptive_avg_pool2d(mask.flatten(0, 1).float()[:, None], cells)[:, 0]
 
 
-def _side(batch: Batch) -> Float[Tensor, "view"]:
+def _side(batch: Batch) -> Float[Tensor, " view"]:
     return batch.is_right.repeat_interleave(batch.images.shape[1]).float()
 
 
@@ -179,7 +179,7 @@ def _true_joints(batch: Batch) -> tuple[Float[Tensor, "view 21 2"], Bool[Tensor,
 
 def _mask_loss(
     logits: Float[Tensor, "view cell cell"], truth: Float[Tensor, "view cell cell"]
-) -> Float[Tensor, "view"]:
+) -> Float[Tensor, " view"]:
     cross_entropy = functional.binary_cross_entropy_with_logits(logits, truth, reduction="none").mean((1, 2))
     p = logits.sigmoid()
     dice = 1 - (2 * (p * truth).sum((1, 2)) + 1) / (p.sum((1, 2)) + truth.sum((1, 2)) + 1)
@@ -188,7 +188,7 @@ def _mask_loss(
 
 def _joint_loss(
     logits: Float[Tensor, "view 21 cell cell"], batch: Batch, sigma_cells: float
-) -> Float[Tensor, "view"]:
+) -> Float[Tensor, " view"]:
     position, inside = _true_joints(batch)
     count = logits.shape[-1]
     centres = torch.arange(count, device=logits.device) + 0.5

@@ -12,7 +12,7 @@ __all__ = ["intersection_over_union", "mean_shape", "voxel_chamfer"]
 
 
 def intersection_over_union(
-    predicted: Bool[Tensor, "batch *shape"], truth: Bool[Tensor, "batch *shape"]
+    predicted: Bool[Tensor, " batch *shape"], truth: Bool[Tensor, " batch *shape"]
 ) -> Float[Tensor, " batch"]:
     """IoU of each pair, 0..1; 1 where both are empty."""
     a, b = predicted.flatten(1), truth.flatten(1)

@@ -56,7 +56,7 @@ def sample_mesh(mesh: SurfaceMesh, count: int, rng: np.random.Generator) -> Samp
     corners = mesh.vertices[mesh.faces].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(cross, axis=1)
-    face: Int[np.ndarray, "point"] = rng.choice(len(area), count, p=area / area.sum())
+    face: Int[np.ndarray, " point"] = rng.choice(len(area), count, p=area / area.sum())
     root, along = np.sqrt(rng.random(count)), rng.random(count)
     weights = np.stack([1.0 - root, root * (1.0 - along), root * along], axis=1)
     return SampledMesh(
@@ -95,7 +95,7 @@ def surface_score(
 
 
 def _f_score(
-    to_true: Float[np.ndarray, "found"], to_found: Float[np.ndarray, "true"], threshold_m: float
+    to_true: Float[np.ndarray, " found"], to_found: Float[np.ndarray, " true"], threshold_m: float
 ) -> float:
     precision, recall = float((to_true <= threshold_m).mean()), float((to_found <= threshold_m).mean())
     return 100.0 * 2.0 * precision * recall / (precision + recall) if precision + recall else 0.0

@@ -39,9 +39,9 @@ class ExtractedSurface:
 class _Crossings:
     """Lattice edges from an inside corner to an outside one; both as flat element numbers of the lattice."""
 
-    keys: Int64[np.ndarray, "vertex"]  # 3 x lower corner + axis, ascending
-    inner: Int64[np.ndarray, "vertex"]
-    outer: Int64[np.ndarray, "vertex"]
+    keys: Int64[np.ndarray, " vertex"]  # 3 x lower corner + axis, ascending
+    inner: Int64[np.ndarray, " vertex"]
+    outer: Int64[np.ndarray, " vertex"]
 
 
 def extract_surface(fields: SurfaceFields, config: ExtractionConfig) -> ExtractedSurface:
@@ -130,7 +130,7 @@ def _place_vertices(
 
 
 def _lattice_points(
-    lattice: CornerLattice, flat: Int64[np.ndarray, "vertex"]
+    lattice: CornerLattice, flat: Int64[np.ndarray, " vertex"]
 ) -> Int64[np.ndarray, "vertex 3"]:
     return np.stack(np.unravel_index(flat, lattice.row.shape), axis=1) + lattice.origin
 

@@ -21,7 +21,7 @@ class CornerLattice:
     resolution: int
     origin: Int[np.ndarray, "3"]  # lattice coordinate of element (0, 0, 0); 0 is the cube's side at -0.5
     row: Int32[np.ndarray, "x y z"]  # row of a corner in the arrays below, -1 where no active voxel has it
-    distances: Float32[np.ndarray, "corner"]  # negative inside
+    distances: Float32[np.ndarray, " corner"]  # negative inside
     positions: Float32[np.ndarray, "corner 3"]  # canonical, deformed
     colors: Float32[np.ndarray, "corner 3"]  # sRGB, 0..1
 
@@ -103,8 +103,8 @@ def fill_uncovered(lattice: CornerLattice, seal: int) -> SignedLattice:
 
 @dataclass(frozen=True, kw_only=True)
 class _Votes:
-    inside: Int[np.ndarray, "region"]
-    outside: Int[np.ndarray, "region"]
+    inside: Int[np.ndarray, " region"]
+    outside: Int[np.ndarray, " region"]
 
 
 def _grow(regions: Int32[np.ndarray, "x y z"], covered: Bool[np.ndarray, "x y z"]) -> None:

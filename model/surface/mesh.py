@@ -83,7 +83,7 @@ def as_manifold(mesh: SurfaceMesh) -> manifold3d.Manifold:
     return solid
 
 
-def face_components(faces: Int[np.ndarray, "face 3"]) -> Int32[np.ndarray, "face"]:
+def face_components(faces: Int[np.ndarray, "face 3"]) -> Int32[np.ndarray, " face"]:
     """Number of the connected component of each face, 0, 1, ...; faces are joined by common vertices."""
     size = int(faces.max()) + 1
     a, b = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
@@ -93,7 +93,7 @@ def face_components(faces: Int[np.ndarray, "face 3"]) -> Int32[np.ndarray, "face
     return np.unique(of_vertex[faces[:, 0]], return_inverse=True)[1].astype(np.int32)
 
 
-def face_volumes(mesh: SurfaceMesh) -> Float[np.ndarray, "face"]:
+def face_volumes(mesh: SurfaceMesh) -> Float[np.ndarray, " face"]:
     """Signed volumes of the tetrahedra between the origin and each face; a closed mesh's volume is their sum."""
     return (mesh.vertices[mesh.faces[:, 0]] * _face_crosses(mesh)).sum(axis=1) / 6.0
 

@@ -136,14 +136,14 @@ def rasterise(
 class _EdgePlanes:
     """Per face three linear functions of the image: share of each corner over its depth; their sum is 1 / depth."""
 
-    seen: Bool[np.ndarray, "face"]  # shows a side with an area
+    seen: Bool[np.ndarray, " face"]  # shows a side with an area
     slope_u: Float[np.ndarray, "3 face"]
     slope_v: Float[np.ndarray, "3 face"]
     offset: Float[np.ndarray, "3 face"]  # value at `center`
     center: Float[np.ndarray, "2 face"]
 
     def weights(
-        self, face: Int[np.ndarray, "pair"], u: Float[np.ndarray, "pair"], v: Float[np.ndarray, "pair"]
+        self, face: Int[np.ndarray, " pair"], u: Float[np.ndarray, " pair"], v: Float[np.ndarray, " pair"]
     ) -> Float[np.ndarray, "3 pair"]:
         du, dv = u - self.center[0, face], v - self.center[1, face]
         return self.slope_u[:, face] * du + self.slope_v[:, face] * dv + self.offset[:, face]
@@ -167,8 +167,8 @@ def _edge_planes(
 
 
 def _candidates(
-    corners: Float[np.ndarray, "face 3 2"], seen: Bool[np.ndarray, "face"], image_size: tuple[int, int]
-) -> Iterator[tuple[Int64[np.ndarray, "pair"], Int64[np.ndarray, "pair"], Int64[np.ndarray, "pair"]]]:
+    corners: Float[np.ndarray, "face 3 2"], seen: Bool[np.ndarray, " face"], image_size: tuple[int, int]
+) -> Iterator[tuple[Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"], Int64[np.ndarray, " pair"]]]:
     """Pairs of a face and a pixel within the face's box, as (face, column, row) in chunks."""
     size = np.array(image_size)
     low = np.clip(np.ceil(corners.min(axis=1) - 0.5), 0, size).astype(np.int64)

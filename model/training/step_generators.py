@@ -24,8 +24,8 @@ def sample_generators(seed: int, step: int, places: Sequence[int]) -> list[torch
 
 
 def normal_like(
-    values: Float[torch.Tensor, "batch *rest"], generators: Sequence[torch.Generator]
-) -> Float[torch.Tensor, "batch *rest"]:
+    values: Float[torch.Tensor, " batch *rest"], generators: Sequence[torch.Generator]
+) -> Float[torch.Tensor, " batch *rest"]:
     """Standard normal noise, sample by sample; drawn on the CPU, so any device gets the same."""
     noise = [torch.randn(values.shape[1:], generator=generator) for generator in generators]
     return torch.stack(noise).to(values.device, values.dtype)
@@ -33,6 +33,6 @@ def normal_like(
 
 def uniform(
     generators: Sequence[torch.Generator], device: torch.device | str = "cpu"
-) -> Float[torch.Tensor, "batch"]:
+) -> Float[torch.Tensor, " batch"]:
     """One number in [0, 1) for each sample."""
     return torch.cat([torch.rand(1, generator=generator) for generator in generators]).to(device)

@@ -30,11 +30,11 @@ _ALIKE = 1e-6
 class FrameChoice:
     """Chosen frames in the order of the source, with what decided."""
 
-    positions: Int[np.ndarray, "chosen"]  # in VideoFrames.frames
-    indices: Int[np.ndarray, "chosen"]  # in the source
-    rank: Int[np.ndarray, "chosen"]  # 0: chosen first
-    sharpness: Float[np.ndarray, "chosen"]  # 0..1, against the sharpest of the neighbouring candidates
-    novelty: Float[np.ndarray, "chosen"]  # 0..1, least difference to those chosen before; 1 for the first
+    positions: Int[np.ndarray, " chosen"]  # in VideoFrames.frames
+    indices: Int[np.ndarray, " chosen"]  # in the source
+    rank: Int[np.ndarray, " chosen"]  # 0: chosen first
+    sharpness: Float[np.ndarray, " chosen"]  # 0..1, against the sharpest of the neighbouring candidates
+    novelty: Float[np.ndarray, " chosen"]  # 0..1, least difference to those chosen before; 1 for the first
     n_candidates: int
 
     def record(self) -> list[dict[str, float | int]]:
@@ -81,7 +81,7 @@ def choose_frames(frames: VideoFrames, count: int) -> FrameChoice:
 
 def relative_sharpness(
     images: tuple[UInt8[np.ndarray, "_ _ 3"], ...],
-) -> Float[np.ndarray, "frame"]:
+) -> Float[np.ndarray, " frame"]:
     """Energy of the Laplacian where a frame differs from the median frame, over the best of its neighbours."""
     thumbnails = np.stack([_thumbnail(image) for image in images])
     changed = np.abs(thumbnails - np.median(thumbnails, axis=0)).sum(axis=-1)
@@ -115,7 +115,7 @@ def _differences(images: tuple[UInt8[np.ndarray, "_ _ 3"], ...]) -> Float[np.nda
     return distance / (distance + np.median(positive)) if len(positive) else distance
 
 
-def _spread(indices: Int[np.ndarray, "frame"], count: int) -> Float[np.ndarray, "frame frame"]:
+def _spread(indices: Int[np.ndarray, " frame"], count: int) -> Float[np.ndarray, "frame frame"]:
     """1 for frames that an even spread would keep apart, less for closer ones."""
     fair = max(1.0, float(np.ptp(indices)) / max(1, count - 1))
     apart = np.minimum(1.0, np.abs(indices[:, None] - indices) / fair)

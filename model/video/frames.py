@@ -82,12 +82,12 @@ class VideoFrames:
         return tuple(frame.image for frame in self.frames)
 
     @property
-    def indices(self) -> Int[np.ndarray, "frame"]:
+    def indices(self) -> Int[np.ndarray, " frame"]:
         """Places in the source."""
         return np.array([frame.index for frame in self.frames])
 
     @property
-    def times_s(self) -> Float[np.ndarray, "frame"]:
+    def times_s(self) -> Float[np.ndarray, " frame"]:
         return np.array([frame.time_s for frame in self.frames], np.float64)
 
     @property
@@ -96,7 +96,7 @@ class VideoFrames:
         counts = Counter(change for frame in self.frames for change in frame.changes)
         return tuple(f"{change} ({count} of {len(self)} frames)" for change, count in counts.items())
 
-    def select(self, positions: Sequence[int] | Int[np.ndarray, "chosen"]) -> "VideoFrames":
+    def select(self, positions: Sequence[int] | Int[np.ndarray, " chosen"]) -> "VideoFrames":
         """Only the frames at these positions of `frames`."""
         return replace(self, frames=tuple(self.frames[int(position)] for position in positions))
 

@@ -119,7 +119,7 @@ def _parse_chunks(data: bytes) -> tuple[int, int, int, bytes]:
 
 
 def _undo_simple_filters(
-    filters: UInt8[np.ndarray, "height"], residuals: UInt8[np.ndarray, "height stride"], channels: int
+    filters: UInt8[np.ndarray, " height"], residuals: UInt8[np.ndarray, "height stride"], channels: int
 ) -> UInt8[np.ndarray, "height stride"]:
     """None, Sub and Up: sums along the row, or of whole rows."""
     pixels = residuals.copy()
@@ -135,7 +135,7 @@ def _undo_simple_filters(
 
 
 def _undo_any_filters(
-    filters: UInt8[np.ndarray, "height"], residuals: UInt8[np.ndarray, "height width channels"]
+    filters: UInt8[np.ndarray, " height"], residuals: UInt8[np.ndarray, "height width channels"]
 ) -> UInt8[np.ndarray, "height width channels"]:
     """All five filters, one anti-diagonal at a time.
 

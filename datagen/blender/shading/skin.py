@@ -127,7 +127,7 @@ def sleeve_material(look: HandLook, axis: Float[np.ndarray, "3"]) -> bpy.types.M
 
 def arm_color_and_blend(
     topology: HandSurface, verts: Float[np.ndarray, "vert 3"], look: HandLook
-) -> tuple[Float[np.ndarray, "vert 3"], Float[np.ndarray, "vert"]]:
+) -> tuple[Float[np.ndarray, "vert 3"], Float[np.ndarray, " vert"]]:
     """Colour that continues the skin of the wrist along the forearm, and where it applies.
 
     A forearm vertex takes the colour of the nearest hand vertices that lie clear of the wrist's

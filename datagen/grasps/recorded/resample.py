@@ -66,9 +66,9 @@ def _same_instant(frame: int, old_fps: float, begin_s: float, fps: float) -> int
 
 def _between(
     rotations: Rotation,
-    left: Int[np.ndarray, "new"],
-    right: Int[np.ndarray, "new"],
-    share: Float[np.ndarray, "new"],
+    left: Int[np.ndarray, " new"],
+    right: Int[np.ndarray, " new"],
+    share: Float[np.ndarray, " new"],
 ) -> Rotation:
     """Spherical interpolation along the shorter way."""
     step = (rotations[left].inv() * rotations[right]).as_rotvec()
@@ -76,10 +76,10 @@ def _between(
 
 
 def _mix(
-    values: Float[np.ndarray, "old *rest"],
-    left: Int[np.ndarray, "new"],
-    right: Int[np.ndarray, "new"],
-    share: Float[np.ndarray, "new"],
-) -> Float[np.ndarray, "new *rest"]:
+    values: Float[np.ndarray, " old *rest"],
+    left: Int[np.ndarray, " new"],
+    right: Int[np.ndarray, " new"],
+    share: Float[np.ndarray, " new"],
+) -> Float[np.ndarray, " new *rest"]:
     weight = share.reshape(-1, *[1] * (values.ndim - 1))
     return (1.0 - weight) * values[left] + weight * values[right]

@@ -109,13 +109,13 @@ class _Hand:
 
     shaped: ShapedHand
     body: HandBody
-    pads: tuple[Int[np.ndarray, "_"], ...]  # palmar vertices of each digit's two outer bones
-    bone_of: Int[np.ndarray, "vert"]  # that moves a vertex most
+    pads: tuple[Int[np.ndarray, " _"], ...]  # palmar vertices of each digit's two outer bones
+    bone_of: Int[np.ndarray, " vert"]  # that moves a vertex most
     outward: Float[np.ndarray, "vert 3"]  # normals at rest, unit
     follows: Float[np.ndarray, "vert hinge"]  # share of a hinge's turn that a vertex follows
-    low_rad: Float[np.ndarray, "hinge"]
-    high_rad: Float[np.ndarray, "hinge"]
-    std: Float[np.ndarray, "parameter"]  # of a correction: wrist shift (3), wrist turn (3), hinges
+    low_rad: Float[np.ndarray, " hinge"]
+    high_rad: Float[np.ndarray, " hinge"]
+    std: Float[np.ndarray, " parameter"]  # of a correction: wrist shift (3), wrist turn (3), hinges
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -126,7 +126,7 @@ class _Fit:
     surface: ObjectSurface
     motion: HingedMotion
     T_world_from_obj: Float[np.ndarray, "knot 4 4"]
-    held: Bool[np.ndarray, "knot"]
+    held: Bool[np.ndarray, " knot"]
     config: StandInConfig
 
 
@@ -169,7 +169,7 @@ def fitted_stand_in(
     knots = _spread(0, frames - 1, round(frames / config.knot_frames) + 1)
     parts = _hand(hand, config)
 
-    def fit(motion: HingedMotion, rows: Int[np.ndarray, "row"]) -> _Fit:
+    def fit(motion: HingedMotion, rows: Int[np.ndarray, " row"]) -> _Fit:
         return _Fit(
             hand=parts,
             surface=surface,
@@ -194,7 +194,7 @@ def fitted_stand_in(
     return to_parameters(hand, parts.body, corrected(motion, parts.body, every))
 
 
-def _spread(first: int, last: int, count: int) -> Int[np.ndarray, "_"]:
+def _spread(first: int, last: int, count: int) -> Int[np.ndarray, " _"]:
     """`count` frames from first to last, or every frame where there are fewer."""
     return np.unique(np.linspace(first, last, max(count, 2)).round().astype(int))
 
@@ -254,7 +254,7 @@ def _solve(
 
 def _step(
     normal: Float[np.ndarray, "n n"],
-    gradient: Float[np.ndarray, "n"],
+    gradient: Float[np.ndarray, " n"],
     scaled: Float[np.ndarray, "knot parameter"],
     low: Float[np.ndarray, "knot parameter"],
     high: Float[np.ndarray, "knot parameter"],
@@ -318,7 +318,7 @@ def _near(fit: _Fit, moved: HingedMotion, before: _Near | None) -> _Near:
 
 def _distance_and_gradient(
     surface: ObjectSurface, points_obj: Float[np.ndarray, "point 3"]
-) -> tuple[Float[np.ndarray, "point"], Float[np.ndarray, "point 3"]]:
+) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point 3"]]:
     """Signed distance (m, negative inside) and its unit gradient, object frame."""
     signed, face, closest, _ = igl.signed_distance(
         np.ascontiguousarray(points_obj),
@@ -349,7 +349,7 @@ def _rows(
     moved: HingedMotion,
     near: _Near,
     grips: Bool[np.ndarray, "5"],
-) -> Iterator[tuple[Float[np.ndarray, "row"], Float[np.ndarray, "row parameter"]]]:
+) -> Iterator[tuple[Float[np.ndarray, " row"], Float[np.ndarray, "row parameter"]]]:
     """Residuals (in standard deviations) and Jacobian of each knot: sunken vertices, then gaps."""
     config = fit.config
     axes, origins = hinge_turns(fit.hand.body, moved, near.posed)

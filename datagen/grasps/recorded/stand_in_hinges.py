@@ -119,7 +119,7 @@ def _decomposed(
     return angles
 
 
-def motion_at(motion: HingedMotion, rows: Int[np.ndarray, "row"]) -> HingedMotion:
+def motion_at(motion: HingedMotion, rows: Int[np.ndarray, " row"]) -> HingedMotion:
     """The frames `rows` of a motion."""
     return HingedMotion(
         angles_rad=motion.angles_rad[rows],
@@ -192,7 +192,7 @@ def hinge_turns(
     return axes, origins
 
 
-def palmar_pads(hand: ShapedHand, body: HandBody) -> tuple[Int[np.ndarray, "_"], ...]:
+def palmar_pads(hand: ShapedHand, body: HandBody) -> tuple[Int[np.ndarray, " _"], ...]:
     """Palmar vertices of each digit's two outer bones."""
     bone_of = hand.model.weights.argmax(axis=1)
     outward = skin_normals(hand)

@@ -42,11 +42,11 @@ class WristTarget:
 class HandContacts:
     """Contacts between hand and object at one instant, one row per contact."""
 
-    bone: Int[np.ndarray, "contact"]
+    bone: Int[np.ndarray, " contact"]
     position_world: Float[np.ndarray, "contact 3"]
     normal_world: Float[np.ndarray, "contact 3"]  # unit, from the hand into the object
-    force_n: Float[np.ndarray, "contact"]  # normal component
-    distance_m: Float[np.ndarray, "contact"]  # < 0: overlap
+    force_n: Float[np.ndarray, " contact"]  # normal component
+    distance_m: Float[np.ndarray, " contact"]  # < 0: overlap
 
     def digit_force_n(self) -> Float[np.ndarray, "6"]:
         """Normal force per digit (order of DIGITS), then the palm."""
@@ -119,7 +119,7 @@ class GraspWorld:
     def reset(
         self,
         wrist: WristTarget,
-        angles_rad: Float[np.ndarray, "hinge"],
+        angles_rad: Float[np.ndarray, " hinge"],
         T_world_from_obj: Float[np.ndarray, "4 4"],
         edge: TableEdge | None,
     ) -> None:
@@ -139,7 +139,7 @@ class GraspWorld:
             center, yaw = (float(x), float(y)), float(np.arctan2(outward[1], outward[0]))
         self._place("table", np.array([*center, 0.0]), np.array([np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)]))
 
-    def place_hand(self, wrist: WristTarget, angles_rad: Float[np.ndarray, "hinge"]) -> None:
+    def place_hand(self, wrist: WristTarget, angles_rad: Float[np.ndarray, " hinge"]) -> None:
         """Teleport the hand (and its target)."""
         quaternion = quaternion_wxyz(wrist.R_world_from_hand)
         at = self.wrist_qpos
@@ -203,7 +203,7 @@ class GraspWorld:
             distance_m=np.array(contact.dist)[rows],
         )
 
-    def angles(self) -> Float[np.ndarray, "hinge"]:
+    def angles(self) -> Float[np.ndarray, " hinge"]:
         """Hinge angles, radians."""
         return self.data.qpos[self.hinge_qpos].copy()
 

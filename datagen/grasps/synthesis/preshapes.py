@@ -21,14 +21,14 @@ class PreshapeLibrary:
     """Postures whose thumb pad faces the finger pads; all in the hand frame (origin: wrist joint)."""
 
     angles_rad: Float[np.ndarray, "shape hinge"]
-    curl: Float[np.ndarray, "shape"]  # 0: fingers close from the knuckles, 1: they curl
-    aperture_m: Float[np.ndarray, "shape"]  # thumb pad to finger pads
-    quality: Float[np.ndarray, "shape"]  # opposition, at most 1
+    curl: Float[np.ndarray, " shape"]  # 0: fingers close from the knuckles, 1: they curl
+    aperture_m: Float[np.ndarray, " shape"]  # thumb pad to finger pads
+    quality: Float[np.ndarray, " shape"]  # opposition, at most 1
     middle: Float[np.ndarray, "shape 3"]  # point halfway between the pads
     across: Float[np.ndarray, "shape 3"]  # unit, thumb pad to finger pads
     reach: Float[np.ndarray, "shape 3"]  # unit, from the palm to `middle`, normal to `across`
 
-    def near(self, aperture_m: float) -> Int[np.ndarray, "choice"]:
+    def near(self, aperture_m: float) -> Int[np.ndarray, " choice"]:
         """Rows whose aperture is within one step; empty when the hand cannot open so."""
         return np.flatnonzero(np.abs(self.aperture_m - aperture_m) < APERTURE_STEP_M)
 
@@ -70,7 +70,7 @@ def build_preshapes(body: HandBody) -> PreshapeLibrary:
     )
 
 
-def closing_rates(body: HandBody, curl: float) -> Float[np.ndarray, "hinge"]:
+def closing_rates(body: HandBody, curl: float) -> Float[np.ndarray, " hinge"]:
     """Relative speed of every hinge while the hand closes; fingertips stay flat for curl 0."""
     rate = np.zeros(len(body.hinges))
     for k, hinge in enumerate(body.hinges):
@@ -84,7 +84,7 @@ def closing_rates(body: HandBody, curl: float) -> Float[np.ndarray, "hinge"]:
 
 def _sample_postures(
     body: HandBody, rng: np.random.Generator
-) -> tuple[Float[np.ndarray, "sample hinge"], Float[np.ndarray, "sample"]]:
+) -> tuple[Float[np.ndarray, "sample hinge"], Float[np.ndarray, " sample"]]:
     """Fingers flex together with a slight cascade; the thumb is free within its limits."""
     knuckle, curl = rng.uniform(-5.0, 75.0, SAMPLES), rng.uniform(0.0, 1.0, SAMPLES)
     bend = rng.uniform(4.0, 60.0, SAMPLES)
@@ -111,7 +111,7 @@ def _sample_postures(
     return angles, curl
 
 
-def _strain(body: HandBody, angles: Float[np.ndarray, "sample hinge"]) -> Float[np.ndarray, "sample"]:
+def _strain(body: HandBody, angles: Float[np.ndarray, "sample hinge"]) -> Float[np.ndarray, " sample"]:
     """0 for a thumb in the middle of its ranges, 1 at all its limits."""
     thumb = [k for k, hinge in enumerate(body.hinges) if hinge.digit == "thumb"]
     low = np.array([body.hinges[k].low_rad for k in thumb])
@@ -120,10 +120,10 @@ def _strain(body: HandBody, angles: Float[np.ndarray, "sample hinge"]) -> Float[
 
 
 def _best_per_aperture(
-    aperture: Float[np.ndarray, "sample"],
-    quality: Float[np.ndarray, "sample"],
-    allowed: Bool[np.ndarray, "sample"],
-) -> Int[np.ndarray, "kept"]:
+    aperture: Float[np.ndarray, " sample"],
+    quality: Float[np.ndarray, " sample"],
+    allowed: Bool[np.ndarray, " sample"],
+) -> Int[np.ndarray, " kept"]:
     kept = []
     for low in np.arange(0.01, 0.14, APERTURE_STEP_M):
         rows = np.flatnonzero(allowed & (aperture >= low) & (aperture < low + APERTURE_STEP_M))
@@ -131,5 +131,5 @@ def _best_per_aperture(
     return np.concatenate(kept)
 
 
-def _dot(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+def _dot(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
     return np.einsum("ni,ni->n", a, b)

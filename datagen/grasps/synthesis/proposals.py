@@ -44,7 +44,7 @@ class Proposal:
 
     wrist: WristTarget
     approach_world: Float[np.ndarray, "3"]  # unit; the hand comes along it
-    angles_rad: Float[np.ndarray, "hinge"]  # open
+    angles_rad: Float[np.ndarray, " hinge"]  # open
     curl: float
     score: float
 
@@ -111,7 +111,7 @@ def propose(
 
 def _reachable(
     points: Float[np.ndarray, "point 3"], com: Float[np.ndarray, "3"], edge: TableEdge | None
-) -> Bool[np.ndarray, "point"]:
+) -> Bool[np.ndarray, " point"]:
     """Points from which a grip axis can pass near the centre of mass, beyond the table edge if any."""
     near = np.linalg.norm(points - com, axis=1) < MAX_LEVER_M + 0.5 * MAX_THICKNESS_M
     if edge is None:
@@ -185,7 +185,7 @@ def _place(
 def _slide_in(
     world: GraspWorld,
     wrist: WristTarget,
-    angles: Float[np.ndarray, "hinge"],
+    angles: Float[np.ndarray, " hinge"],
     approach: Float[np.ndarray, "3"],
     start: Start,
 ) -> WristTarget | None:
@@ -214,12 +214,12 @@ def _slide_in(
 
 def closing_step(
     world: GraspWorld,
-    target: Float[np.ndarray, "hinge"],
-    open_rad: Float[np.ndarray, "hinge"],
-    rates: Float[np.ndarray, "hinge"],
+    target: Float[np.ndarray, " hinge"],
+    open_rad: Float[np.ndarray, " hinge"],
+    rates: Float[np.ndarray, " hinge"],
     step_rad: float,
     touching: Float[np.ndarray, "16"],
-) -> tuple[Float[np.ndarray, "hinge"], bool]:
+) -> tuple[Float[np.ndarray, " hinge"], bool]:
     """Flex every joint that does not yet press on the object; whether any still moves.
 
     `touching` is positive for bones in contact. A joint stops when its own bone or one
@@ -245,7 +245,7 @@ def closing_step(
 def _try_closing(
     world: GraspWorld,
     wrist: WristTarget,
-    open_rad: Float[np.ndarray, "hinge"],
+    open_rad: Float[np.ndarray, " hinge"],
     curl: float,
     com: Float[np.ndarray, "3"],
 ) -> float | None:

@@ -29,7 +29,7 @@ CONTACT_N = 0.05
 SUNK_M = 0.002
 
 
-def measured_instants(grasp_frame: int, frames: int) -> Int[np.ndarray, "instant"]:
+def measured_instants(grasp_frame: int, frames: int) -> Int[np.ndarray, " instant"]:
     """Frames at which penetration is measured: the whole motion, most of them while carried."""
     before = np.linspace(0, grasp_frame, 7)[1:-1]
     carried = np.linspace(grasp_frame, frames - 1, INSTANTS)
@@ -61,7 +61,7 @@ def measure_quality(
     posed: PosedHand,
     surface: ObjectSurface,
     trace: MotionTrace,
-    rows: Int[np.ndarray, "instant"],
+    rows: Int[np.ndarray, " instant"],
     com_obj: Float[np.ndarray, "3"],
     attempts: int,
 ) -> GraspQuality:
@@ -107,7 +107,7 @@ def rejection(
 
 def below_table(
     posed: PosedHand, edge: TableEdge | None, body: HandBody, config: GraspConfig
-) -> Bool[np.ndarray, "instant"]:
+) -> Bool[np.ndarray, " instant"]:
     """Instants at which skin or forearm sinks into the table by more than 2 mm."""
     wrist = posed.T_world_from_joint[:, 0]
     axis = wrist[:, :3, :3] @ body.distal

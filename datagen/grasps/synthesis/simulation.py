@@ -67,7 +67,7 @@ class _Recorder:
         self.world = world
         self.every = round(1.0 / (FRAME_RATE_HZ * world.model.opt.timestep))
         self.steps = 0
-        self.angles: list[Float[np.ndarray, "hinge"]] = []
+        self.angles: list[Float[np.ndarray, " hinge"]] = []
         self.wrists: list[WristTarget] = []
         self.objects: list[Float[np.ndarray, "4 4"]] = []
         self.forces: list[Float[np.ndarray, "6"]] = []
@@ -187,7 +187,7 @@ class _Squeeze:
     """How the fingers press: their total force and the shift of the joint targets that makes it."""
 
     force_n: float
-    shift_rad: Float[np.ndarray, "hinge"]
+    shift_rad: Float[np.ndarray, " hinge"]
 
 
 def _squeeze(world: GraspWorld, recorder: _Recorder, contacts: HandContacts, config: GraspConfig) -> _Squeeze:

@@ -27,8 +27,8 @@ class RestingPoses:
     """Orientations in which the object stays put on a table, likeliest first."""
 
     R_world_from_obj: Float[np.ndarray, "pose 3 3"]
-    weight: Float[np.ndarray, "pose"]  # sums to 1
-    height_m: Float[np.ndarray, "pose"]
+    weight: Float[np.ndarray, " pose"]  # sums to 1
+    height_m: Float[np.ndarray, " pose"]
     hull_verts_obj: Float[np.ndarray, "vert 3"]
     com_obj: Float[np.ndarray, "3"]
 

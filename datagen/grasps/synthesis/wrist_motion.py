@@ -29,7 +29,7 @@ class WristPath:
     R_world_from_hand: Float[np.ndarray, "step 3 3"]
 
 
-def minimum_jerk(steps: int) -> Float[np.ndarray, "step"]:
+def minimum_jerk(steps: int) -> Float[np.ndarray, " step"]:
     """0..1 with zero velocity and acceleration at both ends; the last value is 1."""
     s = np.arange(1, steps + 1) / steps
     return s**3 * (10.0 - 15.0 * s + 6.0 * s**2)

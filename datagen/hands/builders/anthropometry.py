@@ -26,7 +26,7 @@ def hand_length(hand: HandArrays) -> float:
     return float(np.linalg.norm(digit_chain(hand, "middle")[3] - hand.joints[0]))
 
 
-def segment_lengths(hand: HandArrays, digit: str) -> Float[np.ndarray, "segment"]:
+def segment_lengths(hand: HandArrays, digit: str) -> Float[np.ndarray, " segment"]:
     """Lengths of a digit's segments in the order of SEGMENT_FRACTIONS, metres."""
     chain = digit_chain(hand, digit)
     if digit != "thumb":
@@ -34,6 +34,6 @@ def segment_lengths(hand: HandArrays, digit: str) -> Float[np.ndarray, "segment"
     return np.linalg.norm(np.diff(chain, axis=0), axis=1)
 
 
-def segment_deviation(hand: HandArrays, digit: str) -> Float[np.ndarray, "segment"]:
+def segment_deviation(hand: HandArrays, digit: str) -> Float[np.ndarray, " segment"]:
     """Relative deviation of each segment from the published fraction (0.05 = 5 % too long)."""
     return segment_lengths(hand, digit) / (hand_length(hand) * SEGMENT_FRACTIONS[digit]) - 1.0

@@ -190,8 +190,8 @@ def _relief(
 
 
 def _regress(
-    target: Float[np.ndarray, "skin value"], on: Float[np.ndarray, "skin"]
-) -> tuple[Float[np.ndarray, "value"], Float[np.ndarray, "skin value"]]:
+    target: Float[np.ndarray, "skin value"], on: Float[np.ndarray, " skin"]
+) -> tuple[Float[np.ndarray, " value"], Float[np.ndarray, "skin value"]]:
     """Change per standard deviation of `on`, and what it does not explain."""
     z = (on - on.mean()) / on.std()
     column = z @ target / len(z)
@@ -200,7 +200,7 @@ def _regress(
 
 def _fit(
     names: list[str], values: Float[np.ndarray, "skin value"]
-) -> tuple[Float[np.ndarray, "value"], Float[np.ndarray, "value axis"], list[str]]:
+) -> tuple[Float[np.ndarray, " value"], Float[np.ndarray, "value axis"], list[str]]:
     """Mean, one column per axis, and what each axis changes."""
     mean = values.mean(axis=0)
     tone, left = _regress(values - mean, values.mean(axis=1))
@@ -246,12 +246,12 @@ def _mean_rgb(values: Float[np.ndarray, "skin value"]) -> Float[np.ndarray, "ski
     return values.reshape(len(values), 3, -1).mean(axis=2)
 
 
-def _rounded(row: Float[np.ndarray, "number"], digits: int) -> list[float]:
+def _rounded(row: Float[np.ndarray, " number"], digits: int) -> list[float]:
     return [round(float(number), digits) for number in row]
 
 
 def _save_picture(
-    values: Float[np.ndarray, "value"],
+    values: Float[np.ndarray, " value"],
     mask: Bool[np.ndarray, "3 column row"],
     path: Path,
     size: int,

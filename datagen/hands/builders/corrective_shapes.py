@@ -55,7 +55,7 @@ def _rest_offset(hand: HandArrays, joint: int, rotvec: Float[np.ndarray, "3"]) -
 
 
 def _swelling(
-    hand: HandArrays, share: Float[np.ndarray, "vert"], verts: Float[np.ndarray, "vert 3"]
+    hand: HandArrays, share: Float[np.ndarray, " vert"], verts: Float[np.ndarray, "vert 3"]
 ) -> Float[np.ndarray, "vert 3"]:
     """Offset of the blending flesh along its normals that takes `verts` back to the volume at rest."""
     bell = 4.0 * share * (1.0 - share)

@@ -48,7 +48,7 @@ class HandArrays:
     hands_mean: Float[np.ndarray, "45"]
     tip_ids: Int[np.ndarray, "5"]
     corner_uv: Float[np.ndarray, "face 3 2"]
-    wrist_loop: Int[np.ndarray, "loop"]
+    wrist_loop: Int[np.ndarray, " loop"]
 
     @property
     def joints(self) -> Float[np.ndarray, "16 3"]:
@@ -83,7 +83,7 @@ def read_base_hand(path: Path) -> HandArrays:
     )
 
 
-def _border_loop(faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, "loop"]:
+def _border_loop(faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, " loop"]:
     """Vertices of the one open border, following the half-edges of its faces."""
     half_edges = {(int(a), int(b)) for a, b in faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)}
     after = {a: b for a, b in half_edges if (b, a) not in half_edges}
@@ -114,7 +114,7 @@ def descendants(joint: int) -> list[int]:
 
 def fit_regressor_row(
     samples: Float[np.ndarray, "sample vert 3"], targets: Float[np.ndarray, "sample 3"], n_nearest: int = 150
-) -> Float[np.ndarray, "vert"]:
+) -> Float[np.ndarray, " vert"]:
     """Non-negative weights of nearby vertices, summing to one, that give `targets` for all samples."""
     near = np.argsort(np.linalg.norm(samples[0] - targets[0], axis=1), kind="stable")[:n_nearest]
     # Shapes differ from the mean by a few millimetres: fit the mean and the differences, in millimetres.
@@ -143,7 +143,7 @@ def neighbour_mean(faces: Int[np.ndarray, "face 3"], n_verts: int) -> Float[np.n
 
 
 def rotate_about(
-    axis: Float[np.ndarray, "3"], angle_rad: Float[np.ndarray, "n"], points: Float[np.ndarray, "n 3"]
+    axis: Float[np.ndarray, "3"], angle_rad: Float[np.ndarray, " n"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Each point turned by its own angle about one unit axis through the origin (Rodrigues)."""
     cos, sin = np.cos(angle_rad)[:, None], np.sin(angle_rad)[:, None]

@@ -51,7 +51,7 @@ def blend_weights(hand: HandArrays) -> HandArrays:
     return replace(hand, weights=weights)
 
 
-def _joint_steps(hand: HandArrays, digit: str) -> list[Float[np.ndarray, "vert"]]:
+def _joint_steps(hand: HandArrays, digit: str) -> list[Float[np.ndarray, " vert"]]:
     chain = digit_chain(hand, digit)
     bones = np.diff(chain, axis=0)
     bones /= np.linalg.norm(bones, axis=1, keepdims=True)
@@ -63,7 +63,7 @@ def _joint_steps(hand: HandArrays, digit: str) -> list[Float[np.ndarray, "vert"]
     return steps
 
 
-def _finger_shares(hand: HandArrays) -> dict[str, Float[np.ndarray, "vert"]]:
+def _finger_shares(hand: HandArrays) -> dict[str, Float[np.ndarray, " vert"]]:
     """Soft partition of the flesh among the four fingers."""
     names = [digit for digit in DIGIT_JOINTS if digit != "thumb"]
     distance = np.stack([_distance_to_bones(hand, name) for name in names], axis=1)
@@ -75,14 +75,14 @@ def _finger_shares(hand: HandArrays) -> dict[str, Float[np.ndarray, "vert"]]:
     return dict(zip(names, score.T))
 
 
-def _thumb_share(hand: HandArrays) -> Float[np.ndarray, "vert"]:
+def _thumb_share(hand: HandArrays) -> Float[np.ndarray, " vert"]:
     owned = hand.weights[:, 13:].sum(axis=1)
     near = 1.0 - smoothstep(_distance_to_bones(hand, "thumb"), THENAR_FULL, THENAR_NONE)
     in_fingers = hand.weights[:, 1:13].sum(axis=1)
     return np.maximum(owned, near * (1.0 - in_fingers))
 
 
-def _distance_to_bones(hand: HandArrays, digit: str) -> Float[np.ndarray, "vert"]:
+def _distance_to_bones(hand: HandArrays, digit: str) -> Float[np.ndarray, " vert"]:
     chain = digit_chain(hand, digit)
     distances = []
     for start, end in pairwise(chain):

@@ -53,7 +53,7 @@ def _raising_rotation(hand: HandArrays) -> tuple[Float[np.ndarray, "3"], float]:
 
 
 def _smooth_blend(
-    hand: HandArrays, share: Float[np.ndarray, "vert"], samples: Float[np.ndarray, "sample vert 3"]
+    hand: HandArrays, share: Float[np.ndarray, " vert"], samples: Float[np.ndarray, "sample vert 3"]
 ) -> Float[np.ndarray, "sample vert 3"]:
     """Relax the turned part of the flesh, without shrinking it: one step in, one step out (Taubin)."""
     mean = neighbour_mean(hand.faces, len(share))

@@ -54,7 +54,7 @@ def _outward(hand: HandArrays) -> Float[np.ndarray, "3"]:
 
 
 def _cap_faces(
-    loop: Int[np.ndarray, "loop"], n_verts: int
+    loop: Int[np.ndarray, " loop"], n_verts: int
 ) -> tuple[Int[np.ndarray, "face 3"], Int[np.ndarray, "face 3"]]:
     """Outward faces, and for each corner the border vertex (0..loop-1) it looks like.
 

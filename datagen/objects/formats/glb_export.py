@@ -118,7 +118,7 @@ def mesh_to_glb(mesh: ObjectMesh, *, normals: bool = True) -> bytes:
 
 
 def _primitive(
-    writer: _Writer, rows: Float[np.ndarray, "corner column"], index: Int[np.ndarray, "i"], material: int
+    writer: _Writer, rows: Float[np.ndarray, "corner column"], index: Int[np.ndarray, " i"], material: int
 ) -> dict[str, Any]:
     uv = rows[:, 3:5].copy()
     uv[:, 1] = 1.0 - uv[:, 1]

@@ -216,7 +216,7 @@ def _plain_faces(file: GltfFile, primitive: dict[str, Any], n_verts: int) -> Int
     return _triangles(index, primitive.get("mode", TRIANGLES))
 
 
-def _triangles(index: Int[np.ndarray, "corner"], mode: int) -> Int[np.ndarray, "face 3"]:
+def _triangles(index: Int[np.ndarray, " corner"], mode: int) -> Int[np.ndarray, "face 3"]:
     if mode == TRIANGLES:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
     if mode == STRIP:

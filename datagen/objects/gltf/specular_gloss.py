@@ -79,7 +79,7 @@ def metallic_roughness(look: SpecularGloss) -> MetallicRoughness:
 
 def _converted(
     diffuse: Float[np.ndarray, "texel 3"], specular: Float[np.ndarray, "texel 3"]
-) -> tuple[Float[np.ndarray, "texel 3"], Float[np.ndarray, "texel"]]:
+) -> tuple[Float[np.ndarray, "texel 3"], Float[np.ndarray, " texel"]]:
     """Linear base colour and metallic share of linear diffuse and specular colours."""
     f0 = DIELECTRIC_F0
     remaining = 1.0 - specular.max(axis=1)
@@ -128,7 +128,7 @@ def _converted_images(look: SpecularGloss) -> tuple[bytes, bytes]:
 
 def _texels(
     image: np.ndarray | None, rows: slice, shape: tuple[int, int], factor: tuple[float, ...]
-) -> tuple[Float[np.ndarray, "texel 3"], Float[np.ndarray, "texel"]]:
+) -> tuple[Float[np.ndarray, "texel 3"], Float[np.ndarray, " texel"]]:
     """Linear colour times `factor`, and the fourth channel (1 without an image)."""
     count = shape[0] * shape[1]
     if image is None:

@@ -49,7 +49,7 @@ def decimated_mesh(mesh: ObjectMesh, max_faces: int) -> ObjectMesh:
     )
 
 
-def _charts(mesh: ObjectMesh) -> Int[np.ndarray, "face"]:
+def _charts(mesh: ObjectMesh) -> Int[np.ndarray, " face"]:
     """Number of the UV chart of every face: same material, connected through equal UVs."""
     corners = np.concatenate(
         [
@@ -69,7 +69,7 @@ def _charts(mesh: ObjectMesh) -> Int[np.ndarray, "face"]:
 
 
 def _nearest_uv(
-    mesh: ObjectMesh, members: Int[np.ndarray, "member"], points: Float[np.ndarray, "point 3"]
+    mesh: ObjectMesh, members: Int[np.ndarray, " member"], points: Float[np.ndarray, "point 3"]
 ) -> Float[np.ndarray, "point 2"]:
     old_verts = np.ascontiguousarray(mesh.verts_obj)
     member_faces = np.ascontiguousarray(mesh.faces[members])

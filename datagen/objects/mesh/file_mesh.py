@@ -17,6 +17,6 @@ class FileMesh:
     verts_file: Float[np.ndarray, "vert 3"]
     faces: Int[np.ndarray, "face 3"]
     corner_uv: Float[np.ndarray, "face 3 2"]  # (0, 0) is the lower left of the image
-    face_material: Int[np.ndarray, "face"]
+    face_material: Int[np.ndarray, " face"]
     materials: tuple[Material, ...]
     corner_colors: Float[np.ndarray, "face 3 rgb"] | None  # vertex colours, linear 0..1

@@ -35,6 +35,6 @@ class ObjectMesh:
     verts_obj: Float[np.ndarray, "vert 3"]  # metres
     faces: Int[np.ndarray, "face 3"]
     corner_uv: Float[np.ndarray, "face 3 2"]  # (0, 0) is the lower left of the image
-    face_material: Int[np.ndarray, "face"]  # index into `materials`
+    face_material: Int[np.ndarray, " face"]  # index into `materials`
     materials: tuple[Material, ...]
     smooth: bool = True  # smooth shading with 40 degree auto-smooth; False: flat

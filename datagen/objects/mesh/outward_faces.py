@@ -64,7 +64,7 @@ def _without_repeats(mesh: ObjectMesh) -> ObjectMesh:
 
 def _is_mirrored(
     faces: Int[np.ndarray, "face 3"], other: Int[np.ndarray, "face 3"]
-) -> Bool[np.ndarray, "face"]:
+) -> Bool[np.ndarray, " face"]:
     """True where `other` runs through the same three vertices the other way round."""
     same = np.zeros(len(faces), dtype=bool)
     for shift in range(3):
@@ -74,10 +74,10 @@ def _is_mirrored(
 
 def _inward_patches(
     mesh: ObjectMesh,
-    patch: Int[np.ndarray, "face"],
-    flipped: Bool[np.ndarray, "face"],
-    areas: Float[np.ndarray, "face"],
-) -> Bool[np.ndarray, "patch"]:
+    patch: Int[np.ndarray, " face"],
+    flipped: Bool[np.ndarray, " face"],
+    areas: Float[np.ndarray, " face"],
+) -> Bool[np.ndarray, " patch"]:
     """True for patches whose back lets clearly more rays escape than their front."""
     rng = np.random.default_rng(0)
     normals = face_normals(mesh.verts_obj, mesh.faces) * np.where(flipped, -1.0, 1.0)[:, None]
@@ -104,8 +104,8 @@ def _inward_patches(
 
 
 def _area_weighted(
-    faces: Int[np.ndarray, "face"], areas: Float[np.ndarray, "all_face"], rng: np.random.Generator
-) -> Int[np.ndarray, "ray"]:
+    faces: Int[np.ndarray, " face"], areas: Float[np.ndarray, " all_face"], rng: np.random.Generator
+) -> Int[np.ndarray, " ray"]:
     cumulative = np.cumsum(areas[faces])
     picks = np.searchsorted(cumulative, rng.random(RAYS_PER_PATCH) * cumulative[-1], side="right")
     return faces[np.minimum(picks, len(faces) - 1)]

@@ -82,7 +82,7 @@ class _Surface:
 
     def nearest(
         self, points: Float[np.ndarray, "point 3"]
-    ) -> tuple[Float[np.ndarray, "point"], Float[np.ndarray, "point 3"]]:
+    ) -> tuple[Float[np.ndarray, " point"], Float[np.ndarray, "point 3"]]:
         """Distance to the surface, and the nearest point on it."""
         squared, _, nearest = self._tree.squared_distance(
             self.verts, self.faces, np.ascontiguousarray(points)
@@ -114,7 +114,7 @@ class _Surface:
         points: Float[np.ndarray, "point 3"],
         normals: Float[np.ndarray, "point 3"],
         rng: np.random.Generator,
-    ) -> Bool[np.ndarray, "point"]:
+    ) -> Bool[np.ndarray, " point"]:
         """Points from which enough rays leave, on either side of the sheet."""
         rays = ray_intersector(self.verts, self.faces)
         gap = 1e-4 * float(self.size.max())
@@ -237,7 +237,7 @@ def _box_candidates(
 
 def _distances(
     pair: _Pair, T: Float[np.ndarray, "4 4"], stride: int
-) -> tuple[Float[np.ndarray, "a"], Float[np.ndarray, "b"]]:
+) -> tuple[Float[np.ndarray, " a"], Float[np.ndarray, " b"]]:
     """Metres of the rescaled frame: original's seen points to the copy, copy's points to the original."""
     scale = _scale(T)
     moved = pair.points_original[::stride] @ T[:3, :3].T + T[:3, 3]

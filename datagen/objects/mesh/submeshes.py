@@ -11,7 +11,7 @@ from datagen.objects.mesh.object_mesh import ObjectMesh
 __all__ = ["mesh_pieces", "sub_mesh"]
 
 
-def sub_mesh(mesh: ObjectMesh, kept: Bool[np.ndarray, "face"]) -> ObjectMesh:
+def sub_mesh(mesh: ObjectMesh, kept: Bool[np.ndarray, " face"]) -> ObjectMesh:
     """The chosen faces alone; the frame's origin moves to their bbox centre."""
     used, compact = np.unique(mesh.faces[kept], return_inverse=True)
     verts = mesh.verts_obj[used]
@@ -24,7 +24,7 @@ def sub_mesh(mesh: ObjectMesh, kept: Bool[np.ndarray, "face"]) -> ObjectMesh:
     )
 
 
-def mesh_pieces(mesh: ObjectMesh) -> Int[np.ndarray, "face"]:
+def mesh_pieces(mesh: ObjectMesh) -> Int[np.ndarray, " face"]:
     """Which separate thing each face belongs to, numbered along x.
 
     Connected parts whose boxes overlap are one thing (sole and strap of a slipper).

@@ -28,7 +28,7 @@ class SurfaceSamples:
     normals_obj: Float[np.ndarray, "point 3"]  # of the face
     colors: Float[np.ndarray, "point 3"]
     neighbour_colors: Float[np.ndarray, "point 3"]  # `jitter_m` away in the same plane
-    face: Int[np.ndarray, "point"]
+    face: Int[np.ndarray, " point"]
 
 
 def linear_from_srgb(srgb: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
@@ -51,7 +51,7 @@ def _doubled_area_normals(
 
 def face_areas(
     verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"]
-) -> Float[np.ndarray, "face"]:
+) -> Float[np.ndarray, " face"]:
     """Area of every triangle in squared units of the vertices."""
     return 0.5 * np.linalg.norm(_doubled_area_normals(verts, faces), axis=1)
 
@@ -92,7 +92,7 @@ def _material_colors(material: Material, uv: Float[np.ndarray, "point 2"]) -> Fl
 
 
 def colors_at(
-    mesh: ObjectMesh, face: Int[np.ndarray, "point"], barycentric: Float[np.ndarray, "point 3"]
+    mesh: ObjectMesh, face: Int[np.ndarray, " point"], barycentric: Float[np.ndarray, "point 3"]
 ) -> Float[np.ndarray, "point 3"]:
     """sRGB base colour (0..1) of points given by face and barycentric coordinates."""
     uv = np.einsum("pk,pkc->pc", barycentric, mesh.corner_uv[face].astype(np.float64))

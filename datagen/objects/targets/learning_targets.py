@@ -42,7 +42,7 @@ class LearningTargets:
     surface_normals: Float32[np.ndarray, "point 3"]
     surface_colors: UInt8[np.ndarray, "point 3"]  # sRGB base colour, no lighting
     sdf_points: Float32[np.ndarray, "sample 3"]
-    sdf_values: Float32[np.ndarray, "sample"]  # negative inside
+    sdf_values: Float32[np.ndarray, " sample"]  # negative inside
     object_scale_m: float  # longest bbox side in metres
     T_objmesh_from_canonical: Float[np.ndarray, "4 4"]
 

@@ -47,7 +47,7 @@ def _mark(
     occupied[tuple(voxel[touched].T)] = True
 
 
-def _overlaps(triangle: Float[np.ndarray, "pair 3 3"]) -> Bool[np.ndarray, "pair"]:
+def _overlaps(triangle: Float[np.ndarray, "pair 3 3"]) -> Bool[np.ndarray, " pair"]:
     """Separating axes of a triangle and the cube [-0.5, 0.5]^3 around the origin."""
     edges = np.roll(triangle, -1, axis=1) - triangle
     normal = np.cross(edges[:, 0], edges[:, 1])

@@ -47,21 +47,21 @@ class _Band:
 
     index: Int[np.ndarray, "node 3"]
     shape: tuple[int, int, int]
-    distance: Float[np.ndarray, "node"]
-    face: Int[np.ndarray, "node"]
+    distance: Float[np.ndarray, " node"]
+    face: Int[np.ndarray, " node"]
     nearest: Float[np.ndarray, "node 3"]
     points: Float[np.ndarray, "node 3"]
     origin: Float[np.ndarray, "3"]
     voxel: float
 
-    def dense(self, chosen: Bool[np.ndarray, "node"]) -> Bool[np.ndarray, "x y z"]:
+    def dense(self, chosen: Bool[np.ndarray, " node"]) -> Bool[np.ndarray, "x y z"]:
         grid = np.zeros(self.shape, dtype=bool)
         grid[tuple(self.index[chosen].T)] = True
         return grid
 
     def lookup(
         self, grid: Bool[np.ndarray, "x y z"], points: Float[np.ndarray, "point 3"]
-    ) -> Bool[np.ndarray, "point"]:
+    ) -> Bool[np.ndarray, " point"]:
         """Value at the node nearest to each point."""
         index = np.rint((points - self.origin) / self.voxel).astype(np.int64)
         index = np.clip(index, 0, np.array(self.shape) - 1)
@@ -150,7 +150,7 @@ def _side_and_wall(
     faces: Int[np.ndarray, "face 3"],
     band: _Band,
     unreached: Bool[np.ndarray, "x y z"],
-) -> tuple[Float[np.ndarray, "node"], Float[np.ndarray, "node"]]:
+) -> tuple[Float[np.ndarray, " node"], Float[np.ndarray, " node"]]:
     """-1 inside and +1 outside, and the wall thickness (metres) at each node's nearest point."""
     normals = face_normals(verts, faces)[band.face]
     rays = ray_intersector(verts, faces)
@@ -176,7 +176,7 @@ def _side_and_wall(
 
 def _patch_over_holes(
     band: _Band, unreached: Bool[np.ndarray, "x y z"]
-) -> tuple[Int[np.ndarray, "patch_node 3"], Float[np.ndarray, "patch_node"]]:
+) -> tuple[Int[np.ndarray, "patch_node 3"], Float[np.ndarray, " patch_node"]]:
     """Nodes (and values) where the border of what air cannot reach leaves the surface's band."""
     in_band = band.dense(np.ones(len(band.index), dtype=bool))
     block = np.ones((3, 3, 3), bool)
@@ -189,7 +189,7 @@ def _patch_over_holes(
 
 
 def _marching(
-    index: Int[np.ndarray, "node 3"], values: Float[np.ndarray, "node"], band: _Band
+    index: Int[np.ndarray, "node 3"], values: Float[np.ndarray, " node"], band: _Band
 ) -> tuple[Float[np.ndarray, "vert 3"], Int[np.ndarray, "face 3"]]:
     """Marching cubes over the cells whose eight nodes all carry values."""
     row_of_node = np.full(band.shape, -1, dtype=np.int64)

@@ -101,7 +101,7 @@ def _fit(mesh: ObjectMesh, surface: ClosedSurface, hulls: HullFit) -> SolidFit:
 
 def _distance_to(
     surface: ClosedSurface, mesh: ObjectMesh, rng: np.random.Generator
-) -> Float[np.ndarray, "point"]:
+) -> Float[np.ndarray, " point"]:
     """Distance of points of the solid's surface to the drawn mesh."""
     as_mesh = ObjectMesh(
         verts_obj=surface.verts_obj,

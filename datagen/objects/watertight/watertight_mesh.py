@@ -156,7 +156,7 @@ def signed_distance(
     verts: Float[np.ndarray, "vert 3"],
     faces: Int[np.ndarray, "face 3"],
     points: Float[np.ndarray, "point 3"],
-) -> Float[np.ndarray, "point"]:
+) -> Float[np.ndarray, " point"]:
     """Exact distance to the surface, negative inside (generalised winding number > 1/2)."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     squared, _, _ = igl.point_mesh_squared_distance(points, verts, faces)

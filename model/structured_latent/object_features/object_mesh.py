@@ -33,7 +33,7 @@ class TexturedMesh:
     uv: Float32[np.ndarray, "vertex 2"]  # (0, 0) is the lower left of the image, which repeats
     colors: Float32[np.ndarray, "vertex 3"]  # linear light, 0..1; times the texture
     faces: Int32[np.ndarray, "face 3"]
-    face_texture: Int32[np.ndarray, "face"]  # index into `textures`
+    face_texture: Int32[np.ndarray, " face"]  # index into `textures`
     textures: tuple[UInt8[np.ndarray, "_ _ 3"], ...]  # sRGB; white where a material has none
 
 

@@ -128,7 +128,7 @@ def _pyramid(texture: UInt8[np.ndarray, "height width 3"]) -> _Pyramid:
 
 def _levels(
     mesh: TexturedMesh, pyramids: list[_Pyramid], points_px: Float[np.ndarray, "vertex 2"]
-) -> Int[np.ndarray, "face"]:
+) -> Int[np.ndarray, " face"]:
     """Level of the pyramid whose texels are about as large as the pixels, per face.
 
     Along the direction in which the image is least shrunk, as anisotropic filters choose it: an image that is squeezed
@@ -159,7 +159,9 @@ def _texels(
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     right, down = (x - column)[:, None], (y - row)[:, None]
 
-    def at(row: Int[np.ndarray, "pixel"], column: Int[np.ndarray, "pixel"]) -> Float32[np.ndarray, "pixel 3"]:
+    def at(
+        row: Int[np.ndarray, " pixel"], column: Int[np.ndarray, " pixel"]
+    ) -> Float32[np.ndarray, "pixel 3"]:
         return _LINEAR[image[row % height, column % width]]
 
     above = (1.0 - right) * at(row, column) + right * at(row, column + 1)

@@ -58,7 +58,7 @@ class VoxelFeatures:
     distances: Float32[np.ndarray, "voxel 8"]  # at CORNERS, in voxels, negative inside, within +-2
     normals: Float32[np.ndarray, "voxel 3"]  # mean of the surface points inside, length 0..1
     colors: Float32[np.ndarray, "voxel 3"]  # mean, sRGB 0..1
-    counts: Int[np.ndarray, "voxel"]  # surface points inside
+    counts: Int[np.ndarray, " voxel"]  # surface points inside
 
     @property
     def without_points(self) -> int:
@@ -113,7 +113,7 @@ def object_features(
 
 def corner_distances(
     surface: ObjectSurface, points: Float[np.ndarray, "point 3"]
-) -> Float[np.ndarray, "point"]:
+) -> Float[np.ndarray, " point"]:
     """Signed distance at points near the surface, from the nearest sample; canonical units, negative inside."""
     of_surface = KDTree(surface.points)
     candidates = min(_GRADIENT_CANDIDATES, len(surface.points))
@@ -132,7 +132,7 @@ def corner_distances(
 
 def _rows_of_points(
     points: Float32[np.ndarray, "point 3"], voxels: Int[np.ndarray, "voxel 3"], resolution: int
-) -> Int[np.ndarray, "point"]:
+) -> Int[np.ndarray, " point"]:
     """Row of the voxel that each point lies in, -1 where that voxel is not active."""
     row = np.full((resolution,) * 3, -1)
     row[tuple(voxels.T)] = np.arange(len(voxels))
@@ -145,7 +145,7 @@ class ProjectedFeatures:
     """Image features on voxels."""
 
     features: Float[Tensor, "voxel channel"]  # zero where `views` is 0
-    views: Int[Tensor, "voxel"]  # that show the voxel's centre inside the picture, in front of the camera
+    views: Int[Tensor, " voxel"]  # that show the voxel's centre inside the picture, in front of the camera
 
 
 @torch.no_grad()
@@ -182,7 +182,7 @@ def projected_features(
 
 def _projected(
     points: Float[Tensor, "point 3"], view: ObjectView
-) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, "point"]]:
+) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
     """Projections in -1..1 over the picture, and whether they are inside and in front of the camera."""
     T, K = (torch.from_numpy(matrix).to(points) for matrix in (view.T_cam_from_canonical, view.K))
     points_cam = points @ T[:3, :3].T + T[:3, 3]

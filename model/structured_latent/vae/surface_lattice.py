@@ -27,8 +27,8 @@ _ROUNDS = 4  # of the fixed point; offsets of neighbouring corners differ by far
 class FieldSamples:
     """The field at the points that lie in an active voxel."""
 
-    inside: Bool[Tensor, "point"]  # which of the points asked for; the rest of the fields has these only
-    distance: Float[Tensor, "inside"]  # cells, negative inside
+    inside: Bool[Tensor, " point"]  # which of the points asked for; the rest of the fields has these only
+    distance: Float[Tensor, " inside"]  # cells, negative inside
     color: Float[Tensor, "inside 3"]  # sRGB, 0..1
     # Rows of d distance / du and of d position / du, u the cell's own coordinates; lengths in cells.
     slope: Float[Tensor, "inside 3"]
@@ -41,11 +41,11 @@ class DecodedLattice:
 
     grid: SparseGrid
     corner_of_voxel: Int[Tensor, "voxel 8"]
-    distances: Float[Tensor, "corner"]  # cells, negative inside
+    distances: Float[Tensor, " corner"]  # cells, negative inside
     offsets: Float[Tensor, "corner 3"]  # cells, each less than a half
     colors: Float[Tensor, "corner 3"]  # sRGB, 0..1
 
-    def at(self, points: Float[Tensor, "point 3"], sample: Int[Tensor, "point"]) -> FieldSamples:
+    def at(self, points: Float[Tensor, "point 3"], sample: Int[Tensor, " point"]) -> FieldSamples:
         """The field at canonical points of the samples of that number."""
         start = (points + 0.5) * self.grid.resolution
         row = self._rows(start, sample)
@@ -72,12 +72,12 @@ class DecodedLattice:
         )
 
     def _mix(
-        self, values: Float[Tensor, "corner 3"], row: Int[Tensor, "point"], u: Float[Tensor, "point 3"]
+        self, values: Float[Tensor, "corner 3"], row: Int[Tensor, " point"], u: Float[Tensor, "point 3"]
     ) -> Float[Tensor, "point 3"]:
         weights, _ = _trilinear(u - self.grid.coordinates[row])
         return torch.einsum("pc,pcx->px", weights, values[self.corner_of_voxel[row]])
 
-    def _rows(self, u: Float[Tensor, "point 3"], sample: Int[Tensor, "point"]) -> Int[Tensor, "point"]:
+    def _rows(self, u: Float[Tensor, "point 3"], sample: Int[Tensor, " point"]) -> Int[Tensor, " point"]:
         """Row of the active voxel around a point in lattice coordinates, -1 where there is none."""
         resolution, keys = self.grid.resolution, self.grid.keys
         if not len(keys):
@@ -104,7 +104,7 @@ def decoded_lattice(decoded: SparseTensor) -> DecodedLattice:
     )
 
 
-def _corners(grid: SparseGrid) -> tuple[Int[Tensor, "voxel 8"], Int[Tensor, "corner"]]:
+def _corners(grid: SparseGrid) -> tuple[Int[Tensor, "voxel 8"], Int[Tensor, " corner"]]:
     """Number of each voxel's corners, and how many voxels share each corner."""
     side = grid.resolution + 1
     steps = torch.as_tensor(CORNERS, device=grid.device)

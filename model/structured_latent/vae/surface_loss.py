@@ -123,11 +123,11 @@ def _within(distance: Float[Tensor, "*shape"], limit: float) -> Float[Tensor, "*
     return distance - 0.9 * (distance - distance.clamp(-limit, limit))
 
 
-def _sample_of_rows(counts: Sequence[int], device: torch.device) -> Int[Tensor, "row"]:
+def _sample_of_rows(counts: Sequence[int], device: torch.device) -> Int[Tensor, " row"]:
     return torch.arange(len(counts), device=device).repeat_interleave(torch.tensor(counts, device=device))
 
 
-def _means(values: Float[Tensor, "row"], sample: Int[Tensor, "row"], batch: int) -> Float[Tensor, " batch"]:
+def _means(values: Float[Tensor, " row"], sample: Int[Tensor, " row"], batch: int) -> Float[Tensor, " batch"]:
     total = values.new_zeros(batch).index_add(0, sample, values)
     return total / sample.bincount(minlength=batch).clamp(min=1)
 
