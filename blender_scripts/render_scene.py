@@ -1,4 +1,4 @@
-"""Render the pictures of one scene file: python blender_scripts/render_scene.py --help"""
+"""Render the images of one scene file: python blender_scripts/render_scene.py --help"""
 
 import sys
 from pathlib import Path

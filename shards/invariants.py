@@ -45,7 +45,7 @@ def object_problems(row: ObjectRow) -> list[str]:
 
 
 def clip_problems(clip: ClipRow, frames: Frames, split_rule: SplitRule | None) -> list[str]:
-    """Problems of one clip: camera, split, numbering, and its figures against its frames."""
+    """Problems of one clip: camera, split, numbering, and its metrics against its frames."""
     problems = []
     if split_rule is not None and (expected := split_of_object(clip.object_uid, split_rule)) != clip.split:
         problems.append(f"split: the rule says {expected} for object {clip.object_uid}, found {clip.split}")
@@ -63,9 +63,9 @@ def clip_problems(clip: ClipRow, frames: Frames, split_rule: SplitRule | None) -
     if not np.allclose(frames["time_s"], frames["frame_index"] / clip.fps, atol=1e-6):
         problems.append("time_s is not frame_index / fps")
     for name in ("object_visible_fraction", "hand_visible_fraction"):
-        for figure, value in (("min", frames[name].min()), ("mean", frames[name].mean())):
-            if abs(getattr(clip, f"{name}_{figure}") - value) > FRACTION_TOLERANCE:
-                problems.append(f"{name}_{figure} is not that of the frames")
+        for statistic, value in (("min", frames[name].min()), ("mean", frames[name].mean())):
+            if abs(getattr(clip, f"{name}_{statistic}") - value) > FRACTION_TOLERANCE:
+                problems.append(f"{name}_{statistic} is not that of the frames")
     if clip.has_table != bool(np.isfinite(clip.table_top_z_m)):
         problems.append("has_table and table_top_z_m disagree")
     return problems

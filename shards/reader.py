@@ -28,10 +28,10 @@ from shards.schema import ROW_TYPES, ClipRow, FrameRow, ObjectRow
 from shards.storage.images import Geometry, Masks, decode_geometry, decode_masks, decode_rgb
 from shards.storage.parquet import COPY_AGAIN, ParquetSource
 
-__all__ = ["Dataset", "Frame", "Frames", "Shard", "Table", "open_dataset", "open_shard"]
+__all__ = ["ColumnTable", "Dataset", "Frame", "Frames", "Shard", "open_dataset", "open_shard"]
 
 
-class Table:
+class ColumnTable:
     """Some columns of some rows, as arrays. `table["K"]` has shape (row, 3, 3).
 
     Scalars of type text or bytes come as a list, columns of varying length as a list of arrays.
@@ -70,7 +70,7 @@ class Frame:
     geometry: Geometry
 
 
-class Frames(Table):
+class Frames(ColumnTable):
     """Frames of one clip in time order; images are decoded when asked for, `index` is the frame."""
 
     def __init__(self, arrow: pa.Table, *, where: str) -> None:
@@ -118,11 +118,11 @@ class Shard:
         """All objects with meshes and samples; `read_objects` reads single columns."""
         return self._rows("objects", ObjectRow)
 
-    def read_clips(self, columns: Sequence[str]) -> Table:
+    def read_clips(self, columns: Sequence[str]) -> ColumnTable:
         """The named columns of all clips."""
         return self._table("clips", columns)
 
-    def read_objects(self, columns: Sequence[str]) -> Table:
+    def read_objects(self, columns: Sequence[str]) -> ColumnTable:
         """The named columns of all objects."""
         return self._table("objects", columns)
 
@@ -149,11 +149,11 @@ class Shard:
         table = self._table(name, None)
         return rows_from_table(table.arrow, row_type, where=table.where)
 
-    def _table(self, name: str, columns: Sequence[str] | None) -> Table:
+    def _table(self, name: str, columns: Sequence[str] | None) -> ColumnTable:
         source = self._sources[name]
         groups = [source.read_row_group(i, columns) for i in range(source.num_row_groups)]
         empty = arrow_schema(ROW_TYPES[name]).empty_table()
-        return Table(pa.concat_tables(groups) if groups else empty, ROW_TYPES[name], where=source.path)
+        return ColumnTable(pa.concat_tables(groups) if groups else empty, ROW_TYPES[name], where=source.path)
 
     @cached_property
     def _sources(self) -> dict[str, ParquetSource]:

@@ -71,7 +71,7 @@ class ObjectRow:
         "string", meaning="SHA-256 (hex) of the binary glTF, also where its bytes are left out."
     )
     object_scale_m: float = column(
-        "float64", unit="m", meaning="Longest side of the bounding box of mesh and solid."
+        "float64", unit="m", meaning="Longest side of the bounding box of the drawn and the watertight mesh."
     )
     catalogue_scale: float = column(
         "float64", meaning="Factor applied to the source's own metric size; 1 where it was trusted."

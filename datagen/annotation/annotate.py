@@ -27,7 +27,7 @@ __all__ = [
     "OBJECT_VISIBLE",
     "FrameGeometry",
     "MotionGeometry",
-    "PartFigures",
+    "PartMetrics",
     "annotate_frame",
     "hand_object_distances",
 ]
@@ -39,8 +39,8 @@ ARM_VISIBLE, ARM_AMODAL = MASK_BITS["arm_visible"], MASK_BITS["arm_amodal"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class PartFigures:
-    """One part in one picture. Boxes are x0 y0 x1 y1 in pixel edges, -1 four times when empty."""
+class PartMetrics:
+    """One part in one image. Boxes are x0 y0 x1 y1 in pixel edges, -1 four times when empty."""
 
     box_visible_px: Int[np.ndarray, "4"]
     box_amodal_px: Int[np.ndarray, "4"]
@@ -61,9 +61,9 @@ class FrameGeometry:
     depth_object: Float32[np.ndarray, "height width"]  # the object alone, as if nothing were before it
     normals_cam: Float32[np.ndarray, "height width 3"]  # unit, of the visible triangle, toward the camera
     masks: UInt8[np.ndarray, "height width"]  # bits HAND_VISIBLE ... ARM_AMODAL
-    hand: PartFigures  # without the arm
-    object: PartFigures
-    arm: PartFigures
+    hand: PartMetrics  # without the arm
+    object: PartMetrics
+    arm: PartMetrics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -150,8 +150,8 @@ def hand_and_arm(
     return tuple(parts)
 
 
-class _Picture:
-    """Buffers of one picture while surfaces are laid over each other, nearest first."""
+class _Image:
+    """Buffers of one image while surfaces are laid over each other, nearest first."""
 
     def __init__(self, camera: CameraPath, T_cam_from_world: Float[np.ndarray, "4 4"]) -> None:
         width, height = camera.image_size
@@ -162,7 +162,7 @@ class _Picture:
         self.normals_cam = np.zeros((height, width, 3), np.float32)
         self.amodal = np.zeros((height, width), np.uint8)
         self.visible = np.zeros((height, width), np.uint8)
-        self.windows: dict[int, PixelWindow] = {}  # by amodal bit, where figures have to look
+        self.windows: dict[int, PixelWindow] = {}  # by amodal bit, where metrics have to look
 
     def lay(self, layer: _Layer) -> None:
         T_cam_from_layer = self.T_cam_from_world @ layer.T_world_from_layer
@@ -206,11 +206,11 @@ class _Picture:
         normals[y, x] = caster.unit_normals_cam(T_world_from_cam, hits.triangle[near], rays[near])
         visible[y, x] = 0
 
-    def figures(self, visible_bit: int, amodal_bit: int) -> PartFigures:
+    def metrics(self, visible_bit: int, amodal_bit: int) -> PartMetrics:
         window = self.windows.get(amodal_bit, PixelWindow(x0=0, y0=0, x1=0, y1=0))
         visible = (self.visible[window.slices] & visible_bit) > 0
         amodal = (self.amodal[window.slices] & amodal_bit) > 0
-        return PartFigures(
+        return PartMetrics(
             box_visible_px=_box(visible, window),
             box_amodal_px=_box(amodal, window),
             pixels_visible=int(np.count_nonzero(visible)),
@@ -221,19 +221,19 @@ class _Picture:
 def _annotate(
     geometry: MotionGeometry, layers: tuple[_Layer, ...], camera: CameraPath, frame: int
 ) -> FrameGeometry:
-    picture = _Picture(camera, camera.T_cam_from_world[frame])
+    image = _Image(camera, camera.T_cam_from_world[frame])
     for layer in layers:
-        picture.lay(layer)
+        image.lay(layer)
     if geometry.scene.table is not None and geometry.table is not None:
-        picture.lay_table(geometry.scene.table, geometry.table)
+        image.lay_table(geometry.scene.table, geometry.table)
     return FrameGeometry(
-        depth=np.where(np.isfinite(picture.depth), picture.depth, 0.0).astype(np.float32),
-        depth_object=picture.depth_object,
-        normals_cam=picture.normals_cam,
-        masks=picture.visible | picture.amodal,
-        hand=picture.figures(HAND_VISIBLE, HAND_AMODAL),
-        object=picture.figures(OBJECT_VISIBLE, OBJECT_AMODAL),
-        arm=picture.figures(ARM_VISIBLE, ARM_AMODAL),
+        depth=np.where(np.isfinite(image.depth), image.depth, 0.0).astype(np.float32),
+        depth_object=image.depth_object,
+        normals_cam=image.normals_cam,
+        masks=image.visible | image.amodal,
+        hand=image.metrics(HAND_VISIBLE, HAND_AMODAL),
+        object=image.metrics(OBJECT_VISIBLE, OBJECT_AMODAL),
+        arm=image.metrics(ARM_VISIBLE, ARM_AMODAL),
     )
 
 
@@ -278,6 +278,6 @@ def _ray_component(
 
 
 def _box(mask: Bool[np.ndarray, "height width"], window: PixelWindow) -> Int[np.ndarray, "4"]:
-    """`mask_box_px` of a window of the picture, in pixels of the picture."""
+    """`mask_box_px` of a window of the image, in pixels of the image."""
     box = np.array(mask_box_px(mask))
     return box if box[0] < 0 else box + np.array([window.x0, window.y0, window.x0, window.y0])

@@ -28,7 +28,7 @@ REDISTRIBUTABLE = ("CC0-1.0", "CC-BY-3.0", "CC-BY-4.0", "Apache-2.0", "MIT", "BS
 
 @dataclass(frozen=True, kw_only=True)
 class ShardConfig:
-    """How arrays are stored (figures: DECISIONS.md)."""
+    """How arrays are stored (metrics: DECISIONS.md)."""
 
     depth_compression: Literal["pxr24", "zip"]
     rgb_codec: Literal["png", "jpeg", "webp"]  # png needs nothing to read; the others need Pillow
@@ -85,7 +85,7 @@ def object_row(asset: ObjectAsset, targets: LearningTargets) -> ObjectRow:
         color_detail=asset.texture.color_detail,
         appearance=asset.appearance,
         registration_residual=float("nan") if asset.registration is None else asset.registration.residual,
-        watertight_source=asset.solid.watertight_source,
+        watertight_source=asset.watertight.watertight_source,
     )
 
 
@@ -98,10 +98,10 @@ def clip_row(
     config: ShardConfig,
     dataset_seed: int,
 ) -> ClipRow:
-    """One camera of one motion; the quality figures are those of its frames."""
+    """One camera of one motion; the quality metrics are those of its frames."""
     scene, sequence = sampled.scene, sampled.sequence
     camera, look, quality = scene.cameras[camera_index], scene.hand_look, sampled.sequence.quality
-    figures = sampled.camera_figures[camera_index]
+    metrics = sampled.camera_metrics[camera_index]
     object_visible = [frame.object_visible_fraction for frame in frames]
     hand_visible = [frame.hand_visible_fraction for frame in frames]
     lights, table = scene.lights, scene.table
@@ -159,8 +159,8 @@ def clip_row(
         object_visible_fraction_mean=float(np.mean(object_visible)),
         hand_visible_fraction_min=min(hand_visible),
         hand_visible_fraction_mean=float(np.mean(hand_visible)),
-        object_drift_px=figures.object_drift_px,
-        min_margin_px=figures.min_margin_px,
+        object_drift_px=metrics.object_drift_px,
+        min_margin_px=metrics.min_margin_px,
         render_engine="Cycles",
         render_engine_version=record.engine_version,
         render_device=record.device,
@@ -183,7 +183,7 @@ def frame_row(
     rgb: bytes,
     config: ShardConfig,
 ) -> FrameRow:
-    """One picture with all that is known of it."""
+    """One image with all that is known of it."""
     scene = sampled.scene
     camera = scene.cameras[camera_index]
     T_cam_from_world = camera.T_cam_from_world[frame_index]

@@ -69,7 +69,7 @@ def show_frame(built: BuiltScene, frame: int) -> None:
 
 
 def use_camera(built: BuiltScene, camera: CameraPath, frame: int) -> None:
-    """See the scene through `camera` as it stands at `frame`; sets the picture's size too."""
+    """See the scene through `camera` as it stands at `frame`; sets the image's size too."""
     lens = blender_lens(camera.K, camera.image_size)
     data, render = built.camera.data, bpy.context.scene.render
     data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", SENSOR_WIDTH_MM, lens.focal_mm

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> typing.NoReturn:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description="Render the pictures of a scene file.")
+    parser = argparse.ArgumentParser(description="Render the images of a scene file.")
     parser.add_argument("--scene", type=Path, required=True, help="scene file (.npz)")
     parser.add_argument(
         "--frames-dir", type=Path, required=True, help="folder of cam-00/frame-0000.png; resumed if begun"
@@ -59,6 +59,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--device", choices=typing.get_args(DeviceRequest), default="auto")
     parser.add_argument("--threads", type=int, default=0, help="0: every core")
     parser.add_argument(
-        "--passes", action="store_true", help="write Cycles' Z and index passes (EXR) instead of pictures"
+        "--passes", action="store_true", help="write Cycles' Z and index passes (EXR) instead of images"
     )
     return parser

@@ -51,13 +51,13 @@ def add_object_mesh(mesh: ObjectMesh, materials: list[bpy.types.Material]) -> bp
     """
     verts, joined = np.unique(mesh.verts_obj, axis=0, return_inverse=True)
     faces = joined.reshape(-1)[mesh.faces]
-    solid = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    watertight = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
     drawn = add_mesh(
         "object",
         verts=verts,
-        faces=faces[solid],
-        corner_uv=mesh.corner_uv[solid],
-        face_material=mesh.face_material[solid],
+        faces=faces[watertight],
+        corner_uv=mesh.corner_uv[watertight],
+        face_material=mesh.face_material[watertight],
         materials=materials,
     )
     if mesh.smooth:

@@ -13,10 +13,10 @@ _HARMLESS = ("error: not freed memory",)  # of Blender's exit, counts nothing
 
 
 class RenderError(RuntimeError):
-    """Blender or Cycles reported an error while a picture was made."""
+    """Blender or Cycles reported an error while an image was made."""
 
 
-class Progress:
+class ProgressChannel:
     """One JSON object per line on the standard output the process was started with."""
 
     def __init__(self, stream: IO[str]) -> None:
@@ -49,7 +49,7 @@ class BlenderLog:
         return text
 
 
-def progress_channel() -> tuple[Progress, BlenderLog]:
+def progress_channel() -> tuple[ProgressChannel, BlenderLog]:
     """Take over standard output: ours stays clean, everything else goes to the log.
 
     Works on the file descriptor, because Blender prints from C.
@@ -59,7 +59,7 @@ def progress_channel() -> tuple[Progress, BlenderLog]:
     log = tempfile.TemporaryFile(buffering=0)  # noqa: SIM115 - lives as long as the process
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
     os.dup2(log.fileno(), 1)
-    return Progress(channel), BlenderLog(log)
+    return ProgressChannel(channel), BlenderLog(log)
 
 
 def _is_error(line: str) -> bool:

@@ -10,7 +10,7 @@ import bpy
 
 from datagen.blender.build import build_scene, show_frame, use_camera
 from datagen.blender.devices import select_device
-from datagen.blender.log import BlenderLog, Progress, RenderError
+from datagen.blender.log import BlenderLog, ProgressChannel, RenderError
 from datagen.blender.settings import apply_settings
 from datagen.scene.scene import Scene
 
@@ -23,7 +23,7 @@ def pass_path(frames_dir: Path, camera: int, frame: int) -> Path:
 
 
 def render_passes(
-    scene: Scene, frames_dir: Path, *, threads: int, progress: Progress, log: BlenderLog
+    scene: Scene, frames_dir: Path, *, threads: int, progress: ProgressChannel, log: BlenderLog
 ) -> None:
     """One sample per pixel, at the pixel's centre, for every camera and frame. CPU only."""
     built = build_scene(scene)

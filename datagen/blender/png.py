@@ -7,21 +7,21 @@ from pathlib import Path
 
 from datagen.blender.log import RenderError
 
-__all__ = ["finish_picture"]
+__all__ = ["finish_image"]
 
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _KEPT = (b"IHDR", b"IDAT", b"IEND")
 
 
-def finish_picture(partial: Path, final: Path) -> None:
-    """Check a written picture, drop its metadata and give it its name, in one step.
+def finish_image(partial: Path, final: Path) -> None:
+    """Check a written image, drop its metadata and give it its name, in one step.
 
-    Render times in the file would make equal pictures differ. Raises RenderError when the file
+    Render times in the file would make equal images differ. Raises RenderError when the file
     is not a whole PNG (a disk that filled up leaves one that stops early).
     """
     kept = _kept_chunks(partial.read_bytes() if partial.is_file() else b"")
     if kept is None:
-        raise RenderError(f"{partial}: Blender wrote no complete picture; is the disk full?")
+        raise RenderError(f"{partial}: Blender wrote no complete image; is the disk full?")
     stripped = partial.with_suffix(".stripped")
     stripped.write_bytes(kept)
     os.replace(stripped, final)

@@ -1,4 +1,4 @@
-"""Render every picture of a Scene, resumably, and report each one."""
+"""Render every image of a Scene, resumably, and report each one."""
 
 import hashlib
 import os
@@ -13,20 +13,20 @@ import bpy
 
 from datagen.blender.build import BuiltScene, build_scene, show_frame, use_camera
 from datagen.blender.devices import DeviceRequest, select_device
-from datagen.blender.log import BlenderLog, Progress, RenderError
-from datagen.blender.png import finish_picture
+from datagen.blender.log import BlenderLog, ProgressChannel, RenderError
+from datagen.blender.png import finish_image
 from datagen.blender.settings import apply_settings, sampling_seed
 from datagen.scene.scene import Scene
 from datagen.scene.scene_file import scene_sha256
 
-__all__ = ["Picture", "frame_path", "render_scene", "resume_key"]
+__all__ = ["Image", "frame_path", "render_scene", "resume_key"]
 
-_KEY_FILE = "pictures.sha256"
+_KEY_FILE = "images.sha256"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Picture:
-    """One picture to make."""
+class Image:
+    """One image to make."""
 
     camera: int
     frame: int
@@ -34,7 +34,7 @@ class Picture:
 
 
 def frame_path(frames_dir: Path, camera: int, frame: int) -> Path:
-    """Where the picture of one camera and frame is written: cam-03/frame-0007.png."""
+    """Where the image of one camera and frame is written: cam-03/frame-0007.png."""
     return frames_dir / f"cam-{camera:02d}" / f"frame-{frame:04d}.png"
 
 
@@ -44,19 +44,19 @@ def render_scene(
     *,
     device: DeviceRequest,
     threads: int,
-    progress: Progress,
+    progress: ProgressChannel,
     log: BlenderLog,
 ) -> None:
-    """Write all pictures that are not there yet, frames outer and cameras inner.
+    """Write all images that are not there yet, frames outer and cameras inner.
 
-    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop (figures in
+    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop (metrics in
     DECISIONS.md).
     Raises DeviceError, TextureError, RenderError.
     """
     started = time.perf_counter()
     key = resume_key(scene)
-    missing = _missing_pictures(scene, frames_dir, key)
-    n_pictures = len(scene.cameras) * len(scene.T_world_from_obj)
+    missing = _missing_images(scene, frames_dir, key)
+    n_images = len(scene.cameras) * len(scene.T_world_from_obj)
     built = build_scene(scene)
     used = select_device(device)
     apply_settings(scene, used, threads)
@@ -65,26 +65,26 @@ def render_scene(
     common = {"device": used.backend, "device_names": used.names, "bpy_version": bpy.app.version_string}
     progress.send(
         "start",
-        pictures=n_pictures,
-        skipped=n_pictures - len(missing),
+        images=n_images,
+        skipped=n_images - len(missing),
         resume_key=key,
         seconds=dict(seconds),
         **common,
     )
     clock = _PhaseClock()
     shown = None
-    for picture in missing:
-        if picture.frame != shown:  # touching a mesh makes Cycles rebuild its BVH
-            show_frame(built, picture.frame)
-            shown = picture.frame
-        spent = _render_picture(built, picture, clock, log)
+    for image in missing:
+        if image.frame != shown:  # touching a mesh makes Cycles rebuild its BVH
+            show_frame(built, image.frame)
+            shown = image.frame
+        spent = _render_image(built, image, clock, log)
         for phase, value in spent.items():
             seconds[phase] += value
-        path = str(picture.path.relative_to(frames_dir))
+        path = str(image.path.relative_to(frames_dir))
         progress.send(
             "frame",
-            camera=picture.camera,
-            frame=picture.frame,
+            camera=image.camera,
+            frame=image.frame,
             path=path,
             seconds=_rounded(spent),
             peak_rss_mb=_peak_rss_mb(),
@@ -94,7 +94,7 @@ def render_scene(
     progress.send(
         "done",
         rendered=len(missing),
-        skipped=n_pictures - len(missing),
+        skipped=n_images - len(missing),
         peak_rss_mb=_peak_rss_mb(),
         cpu_seconds=round(time.process_time(), 3),
         seconds=_rounded(seconds),
@@ -103,7 +103,7 @@ def render_scene(
 
 
 def resume_key(scene: Scene) -> str:
-    """Hash of all that decides the pictures: the scene, Blender's version and this package's source."""
+    """Hash of all that decides the images: the scene, Blender's version and this package's source."""
     sha = hashlib.sha256(scene_sha256(scene).encode())
     sha.update(bpy.app.version_string.encode())
     for source in sorted(Path(__file__).parent.rglob("*.py")):
@@ -111,8 +111,8 @@ def resume_key(scene: Scene) -> str:
     return sha.hexdigest()
 
 
-def _missing_pictures(scene: Scene, frames_dir: Path, key: str) -> list[Picture]:
-    """Pictures still to make; pictures of another scene are removed before the key is changed."""
+def _missing_images(scene: Scene, frames_dir: Path, key: str) -> list[Image]:
+    """Images still to make; images of another scene are removed before the key is changed."""
     frames_dir.mkdir(parents=True, exist_ok=True)
     key_file = frames_dir / _KEY_FILE
     if not key_file.is_file() or key_file.read_text() != key:
@@ -122,32 +122,30 @@ def _missing_pictures(scene: Scene, frames_dir: Path, key: str) -> list[Picture]
         partial = key_file.with_suffix(".partial")
         partial.write_text(key)
         os.replace(partial, key_file)
-    pictures = [
-        Picture(camera=camera, frame=frame, path=frame_path(frames_dir, camera, frame))
+    images = [
+        Image(camera=camera, frame=frame, path=frame_path(frames_dir, camera, frame))
         for frame in range(len(scene.T_world_from_obj))
         for camera in range(len(scene.cameras))
     ]
-    return [picture for picture in pictures if not picture.path.is_file()]
+    return [image for image in images if not image.path.is_file()]
 
 
-def _render_picture(
-    built: BuiltScene, picture: Picture, clock: "_PhaseClock", log: BlenderLog
-) -> dict[str, float]:
+def _render_image(built: BuiltScene, image: Image, clock: "_PhaseClock", log: BlenderLog) -> dict[str, float]:
     scene, blender = built.scene, bpy.context.scene
     started = time.perf_counter()
-    camera = scene.cameras[picture.camera]
-    use_camera(built, camera, picture.frame)
-    blender.cycles.seed = sampling_seed(scene.seed, picture.camera, picture.frame)
-    picture.path.parent.mkdir(parents=True, exist_ok=True)
-    partial = picture.path.with_name(f".{picture.path.stem}.partial.png")
+    camera = scene.cameras[image.camera]
+    use_camera(built, camera, image.frame)
+    blender.cycles.seed = sampling_seed(scene.seed, image.camera, image.frame)
+    image.path.parent.mkdir(parents=True, exist_ok=True)
+    partial = image.path.with_name(f".{image.path.stem}.partial.png")
     blender.render.filepath = str(partial)
     clock.reset()
     try:
         bpy.ops.render.render(write_still=True)
     except RuntimeError as error:
-        raise RenderError(f"camera {picture.camera}, frame {picture.frame}: {error}") from error
-    log.check(f"camera {picture.camera}, frame {picture.frame}")
-    finish_picture(partial, picture.path)
+        raise RenderError(f"camera {image.camera}, frame {image.frame}: {error}") from error
+    log.check(f"camera {image.camera}, frame {image.frame}")
+    finish_image(partial, image.path)
     return {
         "sync": clock.first_sample - started,
         "render": clock.rendered - clock.first_sample,

@@ -47,7 +47,7 @@ def apply_settings(scene: Scene, device: Device, threads: int) -> None:
     view.look = "AgX - Medium High Contrast" if settings.view_transform == "AgX" else "None"
     view.exposure = settings.exposure_ev
     for stamp in [name for name in dir(render) if name.startswith("use_stamp")]:
-        setattr(render, stamp, False)  # dates and durations in the files would make equal pictures differ
+        setattr(render, stamp, False)  # dates and durations in the files would make equal images differ
     render.dither_intensity = 0.0
     render.film_transparent = False
     image = render.image_settings
@@ -55,6 +55,6 @@ def apply_settings(scene: Scene, device: Device, threads: int) -> None:
 
 
 def sampling_seed(seed: int, camera: int, frame: int) -> int:
-    """Cycles' seed of one picture, the same in whatever order pictures are rendered."""
+    """Cycles' seed of one image, the same in whatever order images are rendered."""
     digest = hashlib.sha256(f"{seed} {camera} {frame}".encode()).digest()
     return int.from_bytes(digest[:4], "little") & 0x7FFFFFFF

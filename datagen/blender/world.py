@@ -17,7 +17,7 @@ __all__ = ["add_world", "hdri_path"]
 # The shipped HDRIs are 1024 pixels around: seen directly they need the softness of a background
 # out of focus, and lamps in them must not keep the stair steps of their pixels.
 _BACKDROP_BLUR_RAD = 0.008
-_BACKDROP_MAX = 6.0  # radiance beyond this is white in the picture anyway
+_BACKDROP_MAX = 6.0  # radiance beyond this is white in the image anyway
 _SHIPPED = Path("studiolights", "world")
 
 

@@ -77,7 +77,7 @@ def select(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] |
     console.print(selection_table(selection.decisions))
     for line in selection_lines(selection):
         console.print(line)
-    console.print(f"every decision with its reason and figures: {out / SELECTION_FILE}")
+    console.print(f"every decision with its reason and metrics: {out / SELECTION_FILE}")
 
 
 @click.command()

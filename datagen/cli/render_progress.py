@@ -15,7 +15,7 @@ from rich.progress import (
 )
 from rich.text import Text
 
-from datagen.jobs.render_shard import Progress as Step
+from datagen.jobs.render_shard import ShardProgress
 from datagen.plan.plan import MotionPlan
 
 __all__ = ["RenderProgress"]
@@ -65,7 +65,7 @@ class RenderProgress:
     ) -> None:
         self._bar.stop()
 
-    def update(self, step: Step) -> None:
+    def update(self, step: ShardProgress) -> None:
         """Take one step of one motion."""
         motion = self._motions[step.motion_index]
         if step.phase in ("staged", "done", "skipped"):

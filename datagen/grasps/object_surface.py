@@ -1,4 +1,4 @@
-"""The surface that a hand must not enter: the object's own mesh, or its solid where the mesh is open."""
+"""The surface that a hand must not enter: the object's own mesh, or its watertight mesh where the mesh is open."""
 
 import igl
 import numpy as np
@@ -10,10 +10,10 @@ __all__ = ["ObjectSurface", "verts_in_object"]
 
 
 class ObjectSurface:
-    """Signed distance to the object's own mesh, or to its solid where the mesh is open."""
+    """Signed distance to the object's own mesh, or to its watertight mesh where the mesh is open."""
 
     def __init__(self, obj: ObjectAsset) -> None:
-        source = obj.mesh if obj.solid.watertight_source else obj.solid
+        source = obj.mesh if obj.watertight.watertight_source else obj.watertight
         self.verts = np.ascontiguousarray(source.verts_obj, dtype=np.float64)
         self.faces = np.ascontiguousarray(source.faces, dtype=np.int64)
         self.low, self.high = self.verts.min(0), self.verts.max(0)

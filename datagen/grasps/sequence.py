@@ -23,7 +23,7 @@ class TableEdge:
 class GraspQuality:
     """How good a kept grasp is; measured while it was simulated or read.
 
-    `rise_m` and `center_distance_m` are GraspXL's two success figures (FORMATS 2.3).
+    `rise_m` and `center_distance_m` are GraspXL's two success metrics (FORMATS 2.3).
     """
 
     rise_m: float  # object height at the end minus at the start

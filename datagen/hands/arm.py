@@ -1,4 +1,4 @@
-"""Forearm and sleeve behind a hand: rigid with the wrist joint, they close the wrist in every picture."""
+"""Forearm and sleeve behind a hand: rigid with the wrist joint, they close the wrist in every image."""
 
 from dataclasses import dataclass
 

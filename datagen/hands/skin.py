@@ -100,7 +100,7 @@ def load_open_skin() -> SkinBasis:
     table = json.loads((_DATA / "skin.json").read_text())
     size = table["size"]
     inside = _image("footprint.png", size)[..., 0] > 127
-    # (row, column, channel) of the picture to HTML's (channel, column, row)
+    # (row, column, channel) of the image to HTML's (channel, column, row)
     order = np.flatnonzero(np.broadcast_to(inside.T, (3, size, size)))
 
     def values(name: str) -> Float[np.ndarray, " value"]:
@@ -133,5 +133,5 @@ def open_skin_height_png() -> bytes:
 
 
 def _image(name: str, size: int) -> UInt8[np.ndarray, "row column 3"]:
-    picture = Image.open(BytesIO((_DATA / name).read_bytes())).convert("RGB")
-    return np.asarray(picture.resize((size, size), Image.Resampling.BICUBIC))
+    image = Image.open(BytesIO((_DATA / name).read_bytes())).convert("RGB")
+    return np.asarray(image.resize((size, size), Image.Resampling.BICUBIC))

@@ -11,7 +11,7 @@ COLUMNS = ("object", "kept", "tries", "depth mm", "digits", "slip mm", "turned",
 
 
 def grasp_table(report: GraspReport) -> Table:
-    """One row per object and one of all; figures are medians over kept motions, seconds of CPU per kept motion."""
+    """One row per object and one of all; metrics are medians over kept motions, seconds of CPU per kept motion."""
     table = Table(title="grasps", title_justify="left")
     for column in COLUMNS:
         table.add_column(column, justify="left" if column == "object" else "right")

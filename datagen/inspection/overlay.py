@@ -1,4 +1,4 @@
-"""Labels drawn over a picture: mask contours, projected joints, object axes."""
+"""Labels drawn over an image: mask contours, projected joints, object axes."""
 
 import cv2
 import numpy as np
@@ -39,7 +39,7 @@ def draw_labels(
     *,
     zoom: int = 1,
 ) -> UInt8[np.ndarray, "tall wide 3"]:
-    """A copy of the picture, enlarged by `zoom`, with its labels on it."""
+    """A copy of the image, enlarged by `zoom`, with its labels on it."""
     height, width = rgb.shape[:2]
     size = (width * zoom, height * zoom)
     canvas = np.ascontiguousarray(cv2.resize(rgb, size, interpolation=cv2.INTER_CUBIC))

@@ -28,13 +28,13 @@ def replay_table(outcomes: Sequence[ReplayOutcome]) -> Table:
     for column in COLUMNS:
         table.add_column(column, justify="left" if column == "sequence" else "right", no_wrap=True)
     replayed = [(outcome, outcome.sequence) for outcome in outcomes if outcome.sequence is not None]
-    figures = np.array([_figures(sequence) for _, sequence in replayed]).reshape(-1, 10)
-    for (outcome, _), row in zip(replayed, figures):
+    metrics = np.array([_metrics(sequence) for _, sequence in replayed]).reshape(-1, 10)
+    for (outcome, _), row in zip(replayed, metrics):
         table.add_row(_short(outcome.sequence_id), *_cells(row))
     lines = [f"{len(replayed)} of {len(outcomes)} replayed"]
     if replayed:
         table.add_section()
-        for name, row in (("median", np.median(figures, axis=0)), ("largest", figures.max(axis=0))):
+        for name, row in (("median", np.median(metrics, axis=0)), ("largest", metrics.max(axis=0))):
             table.add_row(name, *_cells(row))
         hand = replayed[0][1]
         if hand.stands_in_for:
@@ -52,7 +52,7 @@ def _short(sequence_id: str) -> str:
     return f"{part.rpartition('_')[2]}/{size}/{object_id[:8]}/{stem.rpartition('_')[2]}"
 
 
-def _figures(sequence: GraspSequence) -> Float[np.ndarray, "10"]:
+def _metrics(sequence: GraspSequence) -> Float[np.ndarray, "10"]:
     quality = sequence.quality
     carried_s = (len(sequence.hand_pose) - sequence.grasp_frame) / sequence.fps
     millimetres = 1e3 * np.array(
@@ -61,7 +61,7 @@ def _figures(sequence: GraspSequence) -> Float[np.ndarray, "10"]:
     return np.array([carried_s, *millimetres[:3], quality.digits_in_contact, *millimetres[3:]])
 
 
-def _cells(figures: Float[np.ndarray, "10"]) -> list[str]:
-    held, rise, slip, depth, digits, *distances = figures.tolist()
+def _cells(metrics: Float[np.ndarray, "10"]) -> list[str]:
+    held, rise, slip, depth, digits, *distances = metrics.tolist()
     by_digit = " ".join(f"{distance:4.1f}" for distance in distances)
     return [f"{held:.2f}", f"{rise:.0f}", f"{slip:.1f}", f"{depth:.1f}", f"{digits:.0f}", by_digit]

@@ -1,4 +1,4 @@
-"""Contact sheet: a row of plain pictures and a row of labelled ones for every chosen clip."""
+"""Contact sheet: a row of plain images and a row of labelled ones for every chosen clip."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def contact_sheet(
 def labelled_frame(
     clip: ClipRow, frames: Frames, index: int, axis_length_m: float, *, zoom: int = 1
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """One picture of a clip with its labels."""
+    """One image of a clip with its labels."""
     return draw_labels(
         frames.rgb(index),
         frames.masks(index),
@@ -53,10 +53,10 @@ def labelled_frame(
 
 
 def write_png(path: Path, rgb: UInt8[np.ndarray, "height width 3"]) -> None:
-    """Write a picture for people; OSError when the path cannot be written."""
+    """Write an image for people; OSError when the path cannot be written."""
     ok, data = cv2.imencode(".png", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
     if not ok:
-        raise OSError(f"{path}: cannot encode a picture of shape {rgb.shape}")
+        raise OSError(f"{path}: cannot encode an image of shape {rgb.shape}")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(data.tobytes())
 
@@ -71,14 +71,14 @@ def _clip_rows(
     labelled = [
         _tile(labelled_frame(clip, frames, i, 0.5 * object_scale_m, zoom=zoom), tile_px) for i in moments
     ]
-    picture = np.concatenate([np.concatenate(plain, axis=1), np.concatenate(labelled, axis=1)], axis=0)
-    caption = np.full((CAPTION_PX, picture.shape[1], 3), 32, np.uint8)
+    image = np.concatenate([np.concatenate(plain, axis=1), np.concatenate(labelled, axis=1)], axis=0)
+    caption = np.full((CAPTION_PX, image.shape[1], 3), 32, np.uint8)
     text = (
         f"{clip.clip_id}   {clip.object_uid}   {clip.camera_kind}   {clip.hdri}   "
         f"{clip.table_material or 'no table'}   visible {clip.object_visible_fraction_mean:.2f}"
     )
     cv2.putText(caption, text, (6, 15), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (235, 235, 235), 1, cv2.LINE_AA)
-    return np.concatenate([caption, picture], axis=0)
+    return np.concatenate([caption, image], axis=0)
 
 
 def _tile(rgb: UInt8[np.ndarray, "height width 3"], tile_px: int) -> UInt8[np.ndarray, "tall wide 3"]:

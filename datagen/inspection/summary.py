@@ -10,8 +10,7 @@ import numpy as np
 from rich.console import Group
 from rich.table import Table
 
-from shards.reader import Shard
-from shards.reader import Table as Columns
+from shards.reader import ColumnTable, Shard
 from shards.records import ShardRecord
 
 __all__ = ["shard_line", "shard_summary", "short_uid"]
@@ -80,7 +79,7 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _overview(shard: Shard, clips: Columns) -> Table:
+def _overview(shard: Shard, clips: ColumnTable) -> Table:
     record = shard.record
     sizes = sorted({f"{w} x {h}" for w, h in zip(clips["image_width"], clips["image_height"])})
     splits = Counter(clips["split"])
@@ -102,7 +101,7 @@ def _overview(shard: Shard, clips: Columns) -> Table:
     return table
 
 
-def _objects(objects: Columns, clips: Columns) -> Table:
+def _objects(objects: ColumnTable, clips: ColumnTable) -> Table:
     table = _table("objects", "object", "licence", "author", "longest", "texture", "detail", "clips")
     count = Counter(clips["object_uid"])
     for i, uid in enumerate(objects["object_uid"]):
@@ -118,7 +117,7 @@ def _objects(objects: Columns, clips: Columns) -> Table:
     return table
 
 
-def _motions(clips: Columns) -> Table:
+def _motions(clips: ColumnTable) -> Table:
     """Grasp and setting of each motion; its clips share them."""
     table = _table(
         "motions", "motion", "object", "hand", "depth", "digits", "slip lift/turn", "tries", "light", "table"
@@ -143,7 +142,7 @@ def short_uid(uid: str) -> str:
     return re.sub(r"[0-9a-f]{32}", lambda digits: f"{digits[0][:8]}…", uid)
 
 
-def _hands(clips: Columns) -> Counter[str]:
+def _hands(clips: ColumnTable) -> Counter[str]:
     """Clips per hand model, saying where it only stands in for the recorded one."""
     pairs = zip(clips["hand_model"], clips["hand_stands_in_for"])
     return Counter(f"{model} (stands in for {other})" if other else model for model, other in pairs)
@@ -154,7 +153,7 @@ def _millimetres(metres: float, decimals: int = 0) -> str:
     return "-" if np.isnan(metres) else f"{1000 * metres:.{decimals}f} mm"
 
 
-def _clips(clips: Columns) -> Table:
+def _clips(clips: ColumnTable) -> Table:
     table = _table("clips", "clip", "camera", "fps", "visible mean/min", "drift", "margin", "s/frame")
     for i, clip_id in enumerate(clips["clip_id"]):
         table.add_row(
@@ -169,7 +168,7 @@ def _clips(clips: Columns) -> Table:
     return table
 
 
-def _first_clips(clips: Columns) -> list[int]:
+def _first_clips(clips: ColumnTable) -> list[int]:
     return [int(i) for i in np.unique(clips["motion_index"], return_index=True)[1]]
 
 

@@ -27,7 +27,7 @@ def write_video(shard: Shard, clip_id: str, path: Path, *, repeats: int) -> None
         )
     try:
         for index in [*range(clip.n_frames)] * repeats:
-            picture = np.concatenate([frames.rgb(index), labelled_frame(clip, frames, index, axis_m)], axis=1)
-            writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+            image = np.concatenate([frames.rgb(index), labelled_frame(clip, frames, index, axis_m)], axis=1)
+            writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     finally:
         writer.release()

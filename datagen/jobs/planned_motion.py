@@ -34,7 +34,7 @@ def load_object(config: DatasetConfig, motion: MotionPlan) -> ObjectAsset:
     """The object as it is drawn.
 
     ObjectError where this machine lacks the file or reads it otherwise than the selection did.
-    UnusableObjectError (only with `selection.unusable: remove`) where it reads well, but no solid
+    UnusableObjectError (only with `selection.unusable: remove`) where it reads well, but no watertight mesh
     can be made of it, which the selection does not try. InputError where licence or appearance
     are not those that were planned.
     """

@@ -51,7 +51,7 @@ class Job:
 
     @property
     def work_dir(self) -> Path:
-        """Where pictures wait for their labels; what is there after a kill is used again."""
+        """Where images wait for their labels; what is there after a kill is used again."""
         return motion_dir(self.out, self.motion.shard, self.motion.motion_index).with_suffix(".work")
 
     @property
@@ -94,7 +94,7 @@ def _refuse(error: Exception) -> NoReturn:
 
 
 def run_job(job: Job) -> None:
-    """Grasp, scene, pictures, annotations, rows. What cannot be made is staged as skipped, with the reason."""
+    """Grasp, scene, images, annotations, rows. What cannot be made is staged as skipped, with the reason."""
     timer = PhaseTimer()
     shard, index = job.motion.shard, job.motion.motion_index
     emit(phase="grasp", done=0, total=1)
@@ -147,7 +147,7 @@ def sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledMo
 
 
 def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderRecord:
-    """Let Blender render what is missing of this motion's pictures."""
+    """Let Blender render what is missing of this motion's images."""
     job.work_dir.mkdir(parents=True, exist_ok=True)
     scene_path = job.work_dir / "scene.npz"
     save_scene(sampled.scene, scene_path)
@@ -189,7 +189,7 @@ def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderReco
 def _rows(
     job: Job, sampled: SampledMotion, record: RenderRecord, timer: PhaseTimer
 ) -> tuple[list[ClipRow], list[FrameRow]]:
-    """Annotate every picture and encode it; rows run camera by camera, frame by frame."""
+    """Annotate every image and encode it; rows run camera by camera, frame by frame."""
     n_frames, n_cameras = len(sampled.scene.T_world_from_obj), len(sampled.scene.cameras)
     geometry = MotionGeometry(sampled.scene)
     distances_m = hand_object_distances(sampled.scene)

@@ -31,7 +31,7 @@ from shards.writer import (
     stage_skipped_motion,
 )
 
-__all__ = ["PipelineError", "Progress", "RenderOptions", "render_shard"]
+__all__ = ["PipelineError", "RenderOptions", "ShardProgress", "render_shard"]
 
 
 class PipelineError(RuntimeError):
@@ -49,7 +49,7 @@ class RenderOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Progress:
+class ShardProgress:
     """One step of one motion."""
 
     motion_index: int
@@ -65,7 +65,7 @@ def render_shard(
     out: Path,
     shard: int,
     options: RenderOptions,
-    report: Callable[[Progress], None],
+    report: Callable[[ShardProgress], None],
 ) -> ShardRecord:
     """Render what is missing of one shard and commit it. Safe to repeat, kill and repeat.
 
@@ -80,7 +80,7 @@ def render_shard(
         if not is_shard_committed(out, shard):
             staged = [index for index in indices if is_motion_staged(out, shard, index, provenance)]
             for index in staged:
-                report(Progress(motion_index=index, phase="staged", done=1, total=1))
+                report(ShardProgress(motion_index=index, phase="staged", done=1, total=1))
             waiting = [index for index in indices if index not in staged]
             _run_workers(config_path, out, waiting, shard, options, report)
         return commit_shard(out, shard, motion_indices=indices, provenance=provenance)
@@ -115,7 +115,7 @@ def _run_workers(
     motion_indices: list[int],
     shard: int,
     options: RenderOptions,
-    report: Callable[[Progress], None],
+    report: Callable[[ShardProgress], None],
 ) -> None:
     threads = options.threads_per_worker or max(1, (os.cpu_count() or 1) // options.workers)
     report_lock = threading.Lock()
@@ -123,7 +123,7 @@ def _run_workers(
     def render(motion_index: int) -> ChildError | None:
         def on_event(event: dict[str, Any]) -> None:
             with report_lock:
-                report(Progress(motion_index=motion_index, **event))
+                report(ShardProgress(motion_index=motion_index, **event))
 
         command = [
             sys.executable,

@@ -1,7 +1,7 @@
 """Which motions are worth drawing: licence, takedown, texture quality, degree of object movement.
 
 The paper selects by texture quality and object movement without giving thresholds; here every
-threshold is a setting and every decision is recorded with its figures (`selection.parquet`).
+threshold is a setting and every decision is recorded with its metrics (`selection.parquet`).
 Rules apply in the order of `Rule`; the first one that a motion breaks removes it.
 """
 
@@ -61,7 +61,7 @@ class Rule(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class AnnotationRule:
-    """Pre-filter by a store's own figures, before a mesh is read; objects without annotation pass."""
+    """Pre-filter by a store's own metrics, before a mesh is read; objects without annotation pass."""
 
     min_textures: int
     max_faces: int
@@ -107,13 +107,13 @@ class SelectionConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Decision:
-    """One row of selection.parquet. Figures are NaN (or empty) where a rule before them decided."""
+    """One row of selection.parquet. Metrics are NaN (or empty) where a rule before them decided."""
 
     object_uid: str
     sequence_id: str  # empty: simulated
     kept: bool
     rule: str  # that removed it; empty when kept
-    reason: str  # with figures
+    reason: str  # with metrics
     licence: str
     appearance: str  # original or generated
     texture_resolution_px: float
@@ -312,8 +312,8 @@ def _recorded(
     removed = next(
         ((Rule.MOVEMENT, text.format(found, least)) for found, least, text in checks if found < least), None
     )
-    figures = (rise_m, moved.travel_m, moved.rotation_range_rad)
-    return _decision(uid, file.sequence_id, removed, described, figures)
+    metrics = (rise_m, moved.travel_m, moved.rotation_range_rad)
+    return _decision(uid, file.sequence_id, removed, described, metrics)
 
 
 def _decision(

@@ -14,7 +14,7 @@ from datagen.sampling.visibility import VisibilityProbe
 from datagen.scene.scene import CameraPath
 from shards.geometry import camera_center
 
-__all__ = ["CameraFigures", "CamerasConfig", "PathStyles", "Surroundings", "sample_cameras"]
+__all__ = ["CameraMetrics", "CamerasConfig", "PathStyles", "Surroundings", "sample_cameras"]
 
 CameraKind = Literal["orbit", "arc", "handheld", "dolly", "egocentric"]
 KINDS: tuple[CameraKind, ...] = get_args(CameraKind)
@@ -78,7 +78,7 @@ class Surroundings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CameraFigures:
+class CameraMetrics:
     """What was measured of one camera over all frames; visibility by coarse rays."""
 
     kind: CameraKind
@@ -89,7 +89,7 @@ class CameraFigures:
     visible_fraction_min: float
     visible_fraction_mean: float
     object_size_px: float  # worst frame
-    arm_end_seen: bool  # the end of the drawn arm is in the picture in some frame
+    arm_end_seen: bool  # the end of the drawn arm is in the image in some frame
     distance_m: tuple[float, float]  # camera to object centre: least, greatest
     clearance_m: float  # to the arm and, with a table, to its plane
 
@@ -111,11 +111,11 @@ def sample_cameras(
     probe: VisibilityProbe,
     around: Surroundings,
     rngs: Sequence[np.random.Generator],
-) -> tuple[tuple[CameraPath, ...], tuple[CameraFigures, ...]]:
+) -> tuple[tuple[CameraPath, ...], tuple[CameraMetrics, ...]]:
     """One camera per generator: the first acceptable of `config.attempts` candidates each.
 
     Among the first `config.arm_end_attempts` one that does not show the end of the arm is preferred.
-    Azimuths are spread around the subject. Raises SamplingError, with the figures of the best
+    Azimuths are spread around the subject. Raises SamplingError, with the metrics of the best
     candidate, when a camera finds none.
     """
     start = rngs[0].uniform(0.0, 2.0 * np.pi)
@@ -123,7 +123,7 @@ def sample_cameras(
         _sample_camera(config, subject, probe, around, rng, start + 2.0 * np.pi * index / len(rngs), index)
         for index, rng in enumerate(rngs)
     ]
-    return tuple(path for path, _ in found), tuple(figures for _, figures in found)
+    return tuple(path for path, _ in found), tuple(metrics for _, metrics in found)
 
 
 def _sample_camera(
@@ -134,27 +134,27 @@ def _sample_camera(
     rng: np.random.Generator,
     azimuth_rad: float,
     index: int,
-) -> tuple[CameraPath, CameraFigures]:
+) -> tuple[CameraPath, CameraMetrics]:
     weights = np.array([getattr(config.styles, kind).weight for kind in KINDS])
     spread = np.pi / config.n_cameras
     kind = KINDS[0]
-    best: CameraFigures | None = None
-    second_choice: tuple[CameraPath, CameraFigures] | None = None
+    best: CameraMetrics | None = None
+    second_choice: tuple[CameraPath, CameraMetrics] | None = None
     for attempt in range(1, config.attempts + 1):
         # A kind that cannot see this grasp gives way to the others after half the attempts.
         if attempt == 1 or 2 * attempt > config.attempts:
             kind = KINDS[rng.choice(len(KINDS), p=weights / weights.sum())]
         near_azimuth = azimuth_rad + rng.uniform(-1.0, 1.0) * min(spread * attempt, np.pi)
         path = _candidate(config, subject, around, rng, kind, near_azimuth)
-        figures = _measure(config, subject, probe, around, path, attempt)
-        if not figures.objections(config):
-            if not figures.arm_end_seen or attempt > config.arm_end_attempts:
-                return path, figures
-            second_choice = second_choice or (path, figures)
+        metrics = _measure(config, subject, probe, around, path, attempt)
+        if not metrics.objections(config):
+            if not metrics.arm_end_seen or attempt > config.arm_end_attempts:
+                return path, metrics
+            second_choice = second_choice or (path, metrics)
         if second_choice is not None and attempt >= config.arm_end_attempts:
             return second_choice
-        if best is None or figures.visible_fraction_mean > best.visible_fraction_mean:
-            best = figures
+        if best is None or metrics.visible_fraction_mean > best.visible_fraction_mean:
+            best = metrics
     assert best is not None
     raise SamplingError(
         f"camera {index}: none of {config.attempts} candidates is acceptable; the best ({best.kind}) has "
@@ -210,7 +210,7 @@ def _measure(
     around: Surroundings,
     path: CameraPath,
     attempt: int,
-) -> CameraFigures:
+) -> CameraMetrics:
     center = camera_center(path.T_cam_from_world)
     clearance = np.inf
     if around.table_top_z_m is not None:
@@ -220,7 +220,7 @@ def _measure(
         clearance = min(clearance, float(to_arm) - config.arm_clearance_m)
     seen = probe.look(path.K, path.image_size, path.T_cam_from_world)
     distance = np.linalg.norm(center - subject.object_center_world, axis=-1)
-    return CameraFigures(
+    return CameraMetrics(
         kind=path.kind,
         attempts=attempt,
         fov_rad=float(2.0 * np.arctan(0.5 * path.image_size[0] / path.K[0, 0])),

@@ -25,7 +25,7 @@ class RenderConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class SamplingConfig:
-    """Everything that is drawn at random between a grasp sequence and its pictures."""
+    """Everything that is drawn at random between a grasp sequence and its images."""
 
     clip: ClipConfig
     cameras: CamerasConfig

@@ -31,7 +31,7 @@ class Subject:
 
 @dataclass(frozen=True, kw_only=True)
 class Framing:
-    """Limits of the picture's composition."""
+    """Limits of the image's composition."""
 
     image_size: tuple[int, int]
     margin_px: float

@@ -12,7 +12,7 @@ from datagen.hands.model import ShapedHand
 from datagen.hands.skin import SkinBasis
 from datagen.objects.asset.object_asset import ObjectAsset
 from datagen.sampling.appearance import sample_arm_style, sample_look
-from datagen.sampling.cameras import CameraFigures, CamerasConfig, Surroundings, sample_cameras
+from datagen.sampling.cameras import CameraMetrics, CamerasConfig, Surroundings, sample_cameras
 from datagen.sampling.clip import clip_windows
 from datagen.sampling.config import RenderConfig, SamplingConfig
 from datagen.sampling.errors import SamplingError
@@ -28,7 +28,7 @@ __all__ = ["SampledMotion", "sample_scene"]
 
 @dataclass(frozen=True, kw_only=True)
 class SampledMotion:
-    """A Scene with what its pictures are labelled with; all arrays are of the drawn frames."""
+    """A Scene with what its images are labelled with; all arrays are of the drawn frames."""
 
     scene: Scene
     sequence: GraspSequence  # where it comes from, whole
@@ -42,7 +42,7 @@ class SampledMotion:
     joints_world: Float[np.ndarray, "frame 21 3"]
     contact_force_n: Float[np.ndarray, "frame 5"]
     movement_rad: float  # of the object over the clip: turn + travel / 0.3 m
-    camera_figures: tuple[CameraFigures, ...]  # in the order of scene.cameras
+    camera_metrics: tuple[CameraMetrics, ...]  # in the order of scene.cameras
 
 
 def sample_scene(
@@ -58,7 +58,7 @@ def sample_scene(
 ) -> SampledMotion:
     """Draw clip window, table, cameras, lights and looks of one motion.
 
-    A pure function of its arguments. Raises SamplingError, with figures, when the motion is too short,
+    A pure function of its arguments. Raises SamplingError, with metrics, when the motion is too short,
     sinks into its table, or has no camera that sees enough of the object.
     """
     _require_same_hand(sequence, hand)
@@ -75,7 +75,7 @@ def sample_scene(
     # The first camera's generator also turns the whole ring of cameras; parts start at 1 because
     # a SeedSequence does not tell a missing word from 0.
     camera_rngs = [rng(Stream.CAMERAS, 1 + camera) for camera in range(config.cameras.n_cameras)]
-    cameras, figures = _cameras(config.cameras, asset, hull, dressed, placed, T_world_from_obj, camera_rngs)
+    cameras, metrics = _cameras(config.cameras, asset, hull, dressed, placed, T_world_from_obj, camera_rngs)
     center = placed.object_verts_world.mean(axis=(0, 1))
     lights, background = sample_light(config.lights, center, rng(Stream.LIGHTS), rng(Stream.BACKGROUND))
     scene = Scene(
@@ -112,7 +112,7 @@ def sample_scene(
         joints_world=placed.posed.joints_world,
         contact_force_n=sequence.contact_force_n[frames],
         movement_rad=placed.window.movement_rad,
-        camera_figures=figures,
+        camera_metrics=metrics,
     )
 
 
@@ -135,7 +135,7 @@ def _cameras(
     placed: Placement,
     T_world_from_obj: Float[np.ndarray, "frame 4 4"],
     rngs: list[np.random.Generator],
-) -> tuple[tuple[CameraPath, ...], tuple[CameraFigures, ...]]:
+) -> tuple[tuple[CameraPath, ...], tuple[CameraMetrics, ...]]:
     n_hand = dressed.n_hand_verts
     hand, arm = placed.hand_verts_world[:, :n_hand], placed.hand_verts_world[:, n_hand:]
     middle = 0.5 * (hull.min(axis=0) + hull.max(axis=0))

@@ -8,17 +8,17 @@ from jaxtyping import Bool, Float, Int
 from datagen.geometry.raycast import TriangleCaster, pixel_rays, projected_window
 from shards.geometry import in_frustum, invert_transform, transform_points
 
-__all__ = ["SeenFigures", "VisibilityProbe"]
+__all__ = ["SeenMetrics", "VisibilityProbe"]
 
 SAME_SURFACE_M = 0.002
 
 
 @dataclass(frozen=True, kw_only=True)
-class SeenFigures:
+class SeenMetrics:
     """Per frame."""
 
     visible_fraction: Float[np.ndarray, " frame"]  # 0..1; 0 when no ray meets the object
-    arm_end_seen: Bool[np.ndarray, " frame"]  # the end of the drawn arm is in the picture
+    arm_end_seen: Bool[np.ndarray, " frame"]  # the end of the drawn arm is in the image
     object_size_px: Float[np.ndarray, " frame"]  # square root of its amodal area, full-size pixels
 
 
@@ -48,7 +48,7 @@ class VisibilityProbe:
         K: Float[np.ndarray, "3 3"],
         image_size: tuple[int, int],
         T_cam_from_world: Float[np.ndarray, "frame 4 4"],
-    ) -> SeenFigures:
+    ) -> SeenMetrics:
         """Rays through an image of `rays_across` pixels; the size in pixels is scaled back."""
         coarse = self._rays_across / image_size[0]
         size = (self._rays_across, max(1, round(image_size[1] * coarse)))
@@ -66,7 +66,7 @@ class VisibilityProbe:
             before = hand.cast(invert_transform(T_cam_from_world[frame]), rays[hit]).depth < depth[hit]
             fractions[frame] = 1.0 - np.mean(before)
             sizes[frame] = np.sqrt(np.count_nonzero(hit)) / coarse
-        return SeenFigures(
+        return SeenMetrics(
             visible_fraction=fractions,
             object_size_px=sizes,
             arm_end_seen=self._arm_end_seen(K, image_size, T_cam_from_world),

@@ -1,4 +1,4 @@
-"""Scene: everything that decides the pictures of one motion. Knows nothing of Blender."""
+"""Scene: everything that decides the images of one motion. Knows nothing of Blender."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -113,7 +113,7 @@ class RenderSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Everything that decides the pictures of one motion. World: Z up, metres."""
+    """Everything that decides the images of one motion. World: Z up, metres."""
 
     motion_id: str
     fps: float

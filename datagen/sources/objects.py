@@ -29,7 +29,7 @@ class ObjectsConfig:
     registration: RegistrationConfig  # graspxl: how an original is matched onto the recorded mesh
     reading: ReadingConfig  # folder, objaverse and graspxl
     preparation: PreparationConfig  # all but the starter pack, which is prepared
-    cache_dir: Path | None  # solids and convex parts; null: ~/.cache/forehoi/objects
+    cache_dir: Path | None  # watertight meshes and convex parts; null: ~/.cache/forehoi/objects
     exclude: tuple[str, ...]  # uids that are left out
 
 

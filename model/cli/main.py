@@ -8,7 +8,7 @@ from accelerate import Accelerator
 from rich.console import Console
 from rich.table import Table
 
-from model.cli.metrics_table import figures_table
+from model.cli.metrics_table import metrics_table
 from model.cli.options import plain_errors
 from model.cli.reconstruct import reconstruct_command
 from model.cli.weights import weights
@@ -77,12 +77,12 @@ def train(what: str, config_path: Path, out: Path | None) -> None:
         names = (_part_of(config, what, path),)
     folder = out or Path("runs") / path.stem
     accelerator = Accelerator()
-    figures = {}
+    metrics = {}
     for name in names:
         with TrainingProgress(name, enabled=accelerator.is_main_process) as bar:
-            figures[name] = _train(name, config, folder, accelerator, bar.update)
+            metrics[name] = _train(name, config, folder, accelerator, bar.update)
     if accelerator.is_main_process:
-        Console().print(_table(config, figures, folder))
+        Console().print(_table(config, metrics, folder))
 
 
 def _part_of(config: TrainingConfig | SlatTrainingConfig, name: str, path: Path) -> str:
@@ -108,9 +108,9 @@ def _train(
 
 
 def _table(
-    config: TrainingConfig | SlatTrainingConfig, figures: dict[str, dict[str, float]], folder: Path
+    config: TrainingConfig | SlatTrainingConfig, metrics: dict[str, dict[str, float]], folder: Path
 ) -> Table:
-    """Figures of every part, and what they were measured on."""
+    """Metrics of every part, and what they were measured on."""
     same = config.validation.split == config.data.split
     where = (
         "held-out cameras of the training motions"
@@ -118,6 +118,6 @@ def _table(
         else f"objects of the {config.validation.split} split"
     )
     seen = "the objects are those of the training" if same else "none of these objects was trained on"
-    return figures_table(
-        f"{config.name}: figures on {where}", figures, f"{seen}; checkpoints and TensorBoard logs: {folder}"
+    return metrics_table(
+        f"{config.name}: metrics on {where}", metrics, f"{seen}; checkpoints and TensorBoard logs: {folder}"
     )

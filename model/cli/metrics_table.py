@@ -1,29 +1,29 @@
-"""The table that ends a training: each figure beside what it has to beat."""
+"""The table that ends a training: each metric beside what it has to beat."""
 
 import math
 
 from rich.table import Table
 
-__all__ = ["figures_table"]
+__all__ = ["metrics_table"]
 
 _FOUND, _TRUE = "visible mask, as the hand encoder finds it", "visible mask, the true one"
-# Figure -> the same figure of what it has to beat, and what that is.
+# Metric -> the same metric of its baseline, and what that baseline is.
 TO_BEAT = {
     "voxel_iou": {"mean_shape_iou": "mean training shape"},
     "mask_iou": {"found_visible_iou": _FOUND, "visible_iou": _TRUE},
     "occluded_mask_iou": {"occluded_found_visible_iou": _FOUND, "occluded_visible_iou": _TRUE},
 }
 
-MEAN_LATENT = "mean_latent_"  # of any figure of stage 2
+MEAN_LATENT = "mean_latent_"  # of any metric of stage 2
 
 
-def figures_table(title: str, figures: dict[str, dict[str, float]], caption: str) -> Table:
-    """A row for each figure of each part, and another for each further thing that it has to beat."""
+def metrics_table(title: str, metrics: dict[str, dict[str, float]], caption: str) -> Table:
+    """A row for each metric of each part, and another for each further thing that it has to beat."""
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    for column in ("part", "figure", "value", "to beat", ""):
+    for column in ("part", "metric", "value", "to beat", ""):
         table.add_column(column, justify="right" if column in ("value", "to beat") else "left")
     baselines = {name for to_beat in TO_BEAT.values() for name in to_beat}
-    for part, values in figures.items():
+    for part, values in metrics.items():
         for name, value in values.items():
             if name in baselines or name.startswith(MEAN_LATENT):
                 continue

@@ -1,4 +1,4 @@
-"""`forehoi reconstruct`: a video, pictures or a clip in; masks, voxels and a mesh out."""
+"""`forehoi reconstruct`: a video, images or a clip in; masks, voxels and a mesh out."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -104,7 +104,7 @@ def reconstruct_command(
 ) -> None:
     """Reconstruct the object that a hand holds in INPUT.
 
-    INPUT is a video (mp4, mov, ...), a folder of frames, one picture, or a clip of a dataset (DATASET#CLIP_ID).
+    INPUT is a video (mp4, mov, ...), a folder of frames, one image, or a clip of a dataset (DATASET#CLIP_ID).
     Written are object.glb, voxels.ply, masks/ (the whole object, also where it is hidden), turntable.mp4,
     contact_sheet.png and reconstruction.json. Nothing is left behind when something fails.
 
@@ -118,7 +118,7 @@ def reconstruct_command(
         raise ModelError(
             "INPUT",
             "missing" if source is None else "given beside --held-out",
-            expected="a video, a folder of pictures, or DATASET#CLIP_ID; or --held-out",
+            expected="a video, a folder of images, or DATASET#CLIP_ID; or --held-out",
             action="See forehoi reconstruct --help.",
         )
     if frames is not None and count is not None:
@@ -149,7 +149,7 @@ def _run(request: _Request, folder: Path, clock: StageClock) -> Reconstruction:
         networks = load_networks(request.one, request.two, request.device)
     settings = replace(STANDARD, seed=request.seed)
     result = reconstruct(frames, networks, settings, boxes_px=boxes, clock=clock)
-    with clock.stage("write pictures and meshes"):
+    with clock.stage("write images and meshes"):
         write_result(result, folder)
     write_record(
         folder,

@@ -16,8 +16,8 @@ from model.errors import ModelError
 __all__ = [
     "OCCUPANCY_VOXELS",
     "Batch",
-    "ObjectSurface",
     "SurfaceBatch",
+    "SurfaceTarget",
     "TrainingSample",
     "join_surfaces",
     "stack_samples",
@@ -27,7 +27,7 @@ OCCUPANCY_VOXELS = 64
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class ObjectSurface:
+class SurfaceTarget:
     """Samples of an object's true surface and of its signed distance; canonical frame and unit."""
 
     points: Float32[np.ndarray, "surface 3"]
@@ -57,12 +57,12 @@ class TrainingSample:
     occupancy: Bool[np.ndarray, "64 64 64"]  # [i, j, k] along x, y, z of the canonical frame
     joints_px: Float32[np.ndarray, "view 21 2"]  # NaN behind the camera
     is_right: bool
-    surface: ObjectSurface | None = None  # read only where StreamConfig.surface asks for it
+    surface: SurfaceTarget | None = None  # read only where StreamConfig.surface asks for it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SurfaceBatch:
-    """`ObjectSurface` of several samples, their rows one after another: objects may have different numbers of them."""
+    """`SurfaceTarget` of several samples, their rows one after another: objects may have different numbers of them."""
 
     points: Float[torch.Tensor, "surface 3"]
     normals: Float[torch.Tensor, "surface 3"]
@@ -174,7 +174,7 @@ def stack_samples(samples: Sequence[TrainingSample], ids: Sequence[str], *, shar
 
 
 def join_surfaces(
-    surfaces: Sequence[ObjectSurface], object_uids: Sequence[str], *, shared: bool = False
+    surfaces: Sequence[SurfaceTarget], object_uids: Sequence[str], *, shared: bool = False
 ) -> SurfaceBatch:
     """The surfaces of a batch, in order; `shared` as in `stack_samples`."""
 

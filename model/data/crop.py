@@ -1,6 +1,6 @@
 """Square crops with roll and mirror: pixels, K, pose and targets changed together.
 
-A crop is one affine map of the image, applied in one resampling. It is always the picture of a real
+A crop is one affine map of the image, applied in one resampling. It is always the image of a real
 camera: turning the image about the crop's centre is a roll of the camera about its optical axis plus
 a shift of the principal point, so `K` keeps square pixels and no skew. Mirroring is done to the world
 (`mirrored`): x -> -x in every camera frame and in the canonical frame, so all views must share it.
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from model.data.batch import ObjectSurface, TrainingSample
+from model.data.batch import SurfaceTarget, TrainingSample
 from model.errors import ModelError
 from shards.storage.images import MASK_BITS
 
@@ -37,7 +37,7 @@ _MASK_VALUE = 254
 
 @dataclass(frozen=True, kw_only=True)
 class Augmentation:
-    """How the square is drawn around hand and object, and how the picture is varied."""
+    """How the square is drawn around hand and object, and how the image is varied."""
 
     margin: tuple[float, float]  # side of the square over the longest side of the (turned) boxes, >= 1
     shift: float  # 0: boxes in the centre; 1: anywhere inside the square
@@ -183,7 +183,7 @@ def mirrored(sample: TrainingSample) -> TrainingSample:
     )
 
 
-def mirrored_surface(surface: ObjectSurface) -> ObjectSurface:
+def mirrored_surface(surface: SurfaceTarget) -> SurfaceTarget:
     """The surface of the object in the mirror, x -> -x: its own inverse."""
     F = np.array([-1.0, 1.0, 1.0], np.float32)
     return replace(

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
-from model.data.batch import OCCUPANCY_VOXELS, ObjectSurface, TrainingSample
+from model.data.batch import OCCUPANCY_VOXELS, SurfaceTarget, TrainingSample
 from model.data.clip_frames import BLOB_COLUMNS, ClipFrames
 from model.data.config import StreamConfig
 from model.data.crop import CroppedMasks, SquareCrop, crop_image, crop_masks, draw_crop, mirrored, union_box
 from model.data.index import FRAME_COLUMNS, MotionIndex, MotionRef
 from model.data.order import RandomStream, SampleKey, random_stream
 from shards.errors import CorruptShardError, ImageError, RowError
-from shards.reader import Table
+from shards.reader import ColumnTable
 from shards.schema import ObjectRow
 from shards.storage.bounded_cache import BoundedCache
 from shards.storage.frame_pages import FramePages, local_pages
@@ -48,7 +48,7 @@ _CLIP_COLUMNS = ("clip_id", "K", "image_width", "image_height", "hand_side")
 class _Object:
     T_objmesh_from_canonical: Float[np.ndarray, "4 4"]
     voxels: UInt8[np.ndarray, "voxel 3"]
-    surface: ObjectSurface | None
+    surface: SurfaceTarget | None
 
     def occupancy(self) -> Bool[np.ndarray, "64 64 64"]:
         grid = np.zeros((OCCUPANCY_VOXELS,) * 3, bool)
@@ -68,7 +68,7 @@ class _View:
 
 
 def choose_views(motion: MotionRef, n_views: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """(clip row, frame) of `n_views` different pictures: any cameras, any times, all equally likely."""
+    """(clip row, frame) of `n_views` different images: any cameras, any times, all equally likely."""
     picked = rng.choice(motion.n_frames, n_views, replace=False)
     starts = np.cumsum((0, *motion.frame_counts))
     clips = np.searchsorted(starts, picked, side="right") - 1
@@ -187,7 +187,7 @@ class SampleReader:
             uids = source.read_row_group(group, ["object_uid"])["object_uid"].to_pylist()
             if motion.object_uid in uids:
                 columns = _TARGET_COLUMNS + (_SURFACE_COLUMNS if self._config.surface else ())
-                table = Table(source.read_row_group(group, list(columns)), ObjectRow, where=source.path)
+                table = ColumnTable(source.read_row_group(group, list(columns)), ObjectRow, where=source.path)
                 row = uids.index(motion.object_uid)
                 voxels = table["occupancy_64"][row]
                 if len(voxels) and voxels.max() >= OCCUPANCY_VOXELS:
@@ -200,8 +200,8 @@ class SampleReader:
         raise CorruptShardError("no such object", where=source.path, row=motion.object_uid)
 
 
-def _surface(table: Table, row: int) -> ObjectSurface:
-    return ObjectSurface(
+def _surface(table: ColumnTable, row: int) -> SurfaceTarget:
+    return SurfaceTarget(
         points=table["surface_points"][row],
         normals=table["surface_normals"][row],
         colors=table["surface_colors"][row],

@@ -63,7 +63,7 @@ class FeatureAggregator(nn.Module):
             .unflatten(2, (self.config.hand_grid, self.config.hand_grid))
         )
         map_ = functional.gelu(self.hand_mix(map_), approximate="tanh")
-        # Both grids cover the same picture, corners on corners.
+        # Both grids cover the same image, corners on corners.
         size = (self.config.image_grid, self.config.image_grid)
         shrinks = self.config.image_grid < self.config.hand_grid
         if self.config.image_grid != self.config.hand_grid:

@@ -1,10 +1,10 @@
 """Frozen features kept in memory, for runs whose crops repeat exactly.
 
 Of use without augmentation only (overfitting one motion, validation): a turned or shifted crop is another
-picture. Pictures are recognised by their content, so a crop can never get the features of another.
+image. Images are recognised by their content, so a crop can never get the features of another.
 
 Training asks under autocast, validation without. So that kept features do not depend on who asked first, the encoder
-always runs as it is, in the type of its own weights, and gives the type of the pictures.
+always runs as it is, in the type of its own weights, and gives the type of the images.
 """
 
 import hashlib
@@ -21,11 +21,11 @@ __all__ = ["CachedEncoder", "uncached"]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CachedEncoder:
-    """Another encoder that computes each picture once. Not shared between processes."""
+    """Another encoder that computes each image once. Not shared between processes."""
 
     encoder: FeatureEncoder
     max_views: int
-    """Pictures to keep; later ones are computed each time. One costs 4 * grid^2 * channels bytes in float32."""
+    """Images to keep; later ones are computed each time. One costs 4 * grid^2 * channels bytes in float32."""
     _kept: dict[bytes, Tensor] = field(default_factory=dict, init=False, repr=False)
 
     @property

@@ -69,7 +69,7 @@ class ImageNetPyramid(nn.Module):
     def forward(
         self, images: Float[Tensor, "view 3 size size"]
     ) -> dict[int, Float[Tensor, "view channel i j"]]:
-        """Stride -> map (PYRAMID_CHANNELS), of sRGB pictures in 0..1 whose side is a multiple of 32."""
+        """Stride -> map (PYRAMID_CHANNELS), of sRGB images in 0..1 whose side is a multiple of 32."""
         pixels = ((255 * images - 127) / 128).to(self.network._conv_stem.weight.dtype)
         features = self.network._swish(self.network._bn0(self.network._conv_stem(pixels)))
         levels = {}

@@ -1,5 +1,5 @@
 """The open hand encoder: a small decoder on the frozen ImageNet pyramid, trained on our own shards to find the hand,
-its 21 joints and what it holds. On few pictures this beats a network trained from nothing by far (DECISIONS.md).
+its 21 joints and what it holds. On few images this beats a network trained from nothing by far (DECISIONS.md).
 
 `forehoi train hand_encoder` makes its weights (`hand_training.py`); `packaged_hand_net` gives those that ship with
 the package (model/encoders/data). It sees the same crop as the image encoder.
@@ -123,7 +123,7 @@ class HandNet(nn.Module):
         return sum(cells_per_token(count, grid) ** 2 for count in counts) * self.config.decoder
 
     def forward(self, images: Float[Tensor, "view 3 size size"]) -> HandOutput:
-        """Predictions for sRGB pictures in 0..1 of any size."""
+        """Predictions for sRGB images in 0..1 of any size."""
         fine, coarse = self._decoded(images)
         maps = self.maps(fine)
         return HandOutput(
@@ -135,7 +135,7 @@ class HandNet(nn.Module):
 
     @torch.no_grad()
     def visible_object(self, images: Float[Tensor, "view 3 size size"]) -> Bool[Tensor, "view size size"]:
-        """Mask of the held object as far as it is seen, at the pictures' size."""
+        """Mask of the held object as far as it is seen, at the images' size."""
         logits = self(images).object_logits[:, None].float()
         return functional.interpolate(logits, size=images.shape[-2:], mode="bilinear")[:, 0] > 0
 

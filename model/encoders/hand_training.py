@@ -1,4 +1,4 @@
-"""How the open hand encoder is trained: losses, figures and pictures, as a Task of the trainer."""
+"""How the open hand encoder is trained: losses, metrics and images, as a Task of the trainer."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -16,8 +16,8 @@ from model.training.task import Evaluation, Losses
 
 __all__ = ["HandLossConfig", "HandTask", "hand_losses", "joint_positions"]
 
-_PCK_SIDE = 0.05  # of the picture's side
-_PICTURES = 8
+_PCK_SIDE = 0.05  # of the image's side
+_IMAGES = 8
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,7 +41,7 @@ def hand_losses(
 ) -> dict[str, Float[Tensor, " batch"]]:
     """Losses of each sample: "mask" (cross-entropy + Dice, of hand and arm), "object" (the same of
     the visible part of the held object), "joints" (KL divergence of the
-    predicted from a Gaussian distribution, over the joints inside the picture), "side" (cross-entropy)."""
+    predicted from a Gaussian distribution, over the joints inside the image), "side" (cross-entropy)."""
     batch_view = batch.images.shape[:2]
     view_losses = {
         "mask": _mask_loss(
@@ -59,7 +59,7 @@ def hand_losses(
 
 
 def joint_positions(joint_logits: Float[Tensor, "view 21 cell cell"]) -> Float[Tensor, "view 21 2"]:
-    """(x, y) of each joint in fractions of the picture's side.
+    """(x, y) of each joint in fractions of the image's side.
 
     The mean of the distribution within two cells of its peak: finer than a cell, blind to far modes.
     """
@@ -102,20 +102,20 @@ class HandTask:
 
     @torch.no_grad()
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Figures over all views, and pictures of the first.
+        """Metrics over all views, and images of the first.
 
         hand_mask_iou: hand and arm at stride 4, mean over views; held_object_iou: the same of the visible object.
-        hand_pck5: share of the joints in the picture that are found within 5 % of its side; hand_joint_error:
+        hand_pck5: share of the joints in the image that are found within 5 % of its side; hand_joint_error:
         their mean error in % of the side. hand_side_accuracy: right told from left.
         """
         sums = _Sums()
-        pictures: dict[str, UInt8[np.ndarray, "height width 3"]] = {}
+        images: dict[str, UInt8[np.ndarray, "height width 3"]] = {}
         for batch in batches:
             output = self.module(batch.images.flatten(0, 1))
             sums.add(output, batch)
-            if not pictures:
-                pictures = {"hand": _montage(output, batch)}
-        return Evaluation(figures=sums.figures(), pictures=pictures)
+            if not images:
+                images = {"hand": _montage(output, batch)}
+        return Evaluation(metrics=sums.metrics(), images=images)
 
 
 def _recolored(
@@ -129,7 +129,7 @@ def _recolored(
 
 
 class _Sums:
-    """Figures over all views of all batches."""
+    """Metrics over all views of all batches."""
 
     def __init__(self) -> None:
         self._values: dict[str, list[Tensor]] = {
@@ -152,7 +152,7 @@ class _Sums:
         right = (output.right_logit > 0) == (_side(batch) > 0.5)
         self._values["hand_side_accuracy"].append(right)
 
-    def figures(self) -> dict[str, float]:
+    def metrics(self) -> dict[str, float]:
         """NaN for what had nothing to be measured on."""
         values = {name: torch.cat(parts).float().cpu() for name, parts in self._values.items() if parts}
         distance = values.pop("distance", torch.empty(0))
@@ -171,7 +171,7 @@ def _side(batch: Batch) -> Float[Tensor, " view"]:
 
 
 def _true_joints(batch: Batch) -> tuple[Float[Tensor, "view 21 2"], Bool[Tensor, "view 21"]]:
-    """Positions in fractions of the side (0 where there is none), and which are inside the picture."""
+    """Positions in fractions of the side (0 where there is none), and which are inside the image."""
     position = batch.joints_px.flatten(0, 1).float() / batch.images.shape[-1]
     inside = ((position >= 0) & (position < 1)).all(-1)  # false for NaN
     return torch.where(inside[..., None], position, torch.zeros_like(position)), inside
@@ -192,7 +192,7 @@ def _joint_loss(
     position, inside = _true_joints(batch)
     count = logits.shape[-1]
     centres = torch.arange(count, device=logits.device) + 0.5
-    # A Gaussian of two axes is the product of one of each; normalised over the cells of the picture.
+    # A Gaussian of two axes is the product of one of each; normalised over the cells of the image.
     per_axis = -0.5 * ((centres - count * position[..., None]) / sigma_cells) ** 2
     target = (per_axis[..., 1, :, None] + per_axis[..., 0, None, :]).flatten(2).log_softmax(-1)
     predicted = logits.flatten(2).log_softmax(-1)
@@ -201,8 +201,8 @@ def _joint_loss(
 
 
 def _montage(output: HandOutput, batch: Batch) -> UInt8[np.ndarray, "height width 3"]:
-    """A column for each view: the picture; what is true; what is predicted: hand green, object orange, joints."""
-    images = batch.images.flatten(0, 1)[:_PICTURES].float().cpu()
+    """A column for each view: the image; what is true; what is predicted: hand green, object orange, joints."""
+    images = batch.images.flatten(0, 1)[:_IMAGES].float().cpu()
     size = images.shape[-1]
     truth, inside = _true_joints(batch)
 
@@ -220,8 +220,8 @@ def _montage(output: HandOutput, batch: Batch) -> UInt8[np.ndarray, "height widt
     for view, image in enumerate(images):
         shown = [_marked(image, h[view], o[view], j[view][inside[view].cpu()]) for h, o, j in rows]
         columns.append(torch.cat([image, *shown], dim=1))
-    picture = torch.cat(columns, dim=2).permute(1, 2, 0)
-    return (255 * picture.clamp(0, 1)).round().to(torch.uint8).numpy()
+    montage = torch.cat(columns, dim=2).permute(1, 2, 0)
+    return (255 * montage.clamp(0, 1)).round().to(torch.uint8).numpy()
 
 
 def _marked(

@@ -1,4 +1,4 @@
-"""The one interface of everything that turns pictures into conditioning tokens."""
+"""The one interface of everything that turns images into conditioning tokens."""
 
 from typing import Protocol, runtime_checkable
 
@@ -18,7 +18,7 @@ class FeatureEncoder(Protocol):
 
     @property
     def grid(self) -> int:
-        """Tokens along one side of the picture; token r * grid + c covers row r and column c, from the top left."""
+        """Tokens along one side of the image; token r * grid + c covers row r and column c, from the top left."""
 
     @property
     def channels(self) -> int:
@@ -30,8 +30,8 @@ class FeatureEncoder(Protocol):
     def __call__(
         self, images: Float[Tensor, "batch view 3 size size"]
     ) -> Float[Tensor, "batch view token channel"]:
-        """Features of sRGB pictures in 0..1 of any size, in the pictures' dtype.
+        """Features of sRGB images in 0..1 of any size, in the images' dtype.
 
-        The encoder resizes and normalises by itself. Tokens describe the whole picture, so they are
+        The encoder resizes and normalises by itself. Tokens describe the whole image, so they are
         aligned with it: token r * grid + c is centred at ((c + 0.5), (r + 0.5)) / grid of its sides.
         """

@@ -1,6 +1,6 @@
-"""Pictures to an encoder's size, and its feature maps onto the common token grid, without shifting anything.
+"""Images to an encoder's size, and its feature maps onto the common token grid, without shifting anything.
 
-A cell of a feature map need not look at its even share of the picture (WiLoR's patches start 2 px outside),
+A cell of a feature map need not look at its even share of the image (WiLoR's patches start 2 px outside),
 so every map says where its cells are centred, and tokens are read there.
 """
 
@@ -18,7 +18,7 @@ __all__ = ["CellCentres", "cells_per_token", "detailed_tokens", "resampled_token
 
 @dataclass(frozen=True, kw_only=True)
 class CellCentres:
-    """Cell i of a square feature map is centred at first + spacing * i, in fractions of the picture's side."""
+    """Cell i of a square feature map is centred at first + spacing * i, in fractions of the image's side."""
 
     first: float
     spacing: float

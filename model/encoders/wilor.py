@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet, sRGB
-_PADDING = 2  # pixels around the picture before cutting patches, whatever the patch
+_PADDING = 2  # pixels around the image before cutting patches, whatever the patch
 _DECODER = ("decpose.", "decshape.", "deccam.")  # read the tokens out as MANO parameters
 _ACTION = (
     "Download pretrained_models/wilor_final.ckpt as the WiLoR repository says (2.5 GB, CC BY-NC-ND) and give its "
@@ -39,7 +39,7 @@ _ACTION = (
 
 @dataclass(frozen=True, kw_only=True)
 class WilorLayout:
-    """Sizes of the network. Picture sizes are what its position embedding was made for, in pixels."""
+    """Sizes of the network. Image sizes are what its position embedding was made for, in pixels."""
 
     image_height: int
     image_width: int
@@ -134,7 +134,7 @@ class WilorBackbone(nn.Module):
     def forward(
         self, pixels: Float[Tensor, "view 3 height width"]
     ) -> Float[Tensor, "view channel row column"]:
-        """Features of the patches (WiLoR's img_feat) of ImageNet-normalised pictures of any size."""
+        """Features of the patches (WiLoR's img_feat) of ImageNet-normalised images of any size."""
         patches = self.patch_embed(pixels)
         rows, columns = patches.shape[-2:]
         patches = (patches + self._positions(rows, columns)).flatten(2).transpose(1, 2)

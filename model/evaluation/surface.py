@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.spatial import KDTree
 
-from model.data.batch import ObjectSurface
+from model.data.batch import SurfaceTarget
 from model.surface.mesh import SurfaceMesh
 
 __all__ = ["PointScore", "SampledMesh", "SurfaceScore", "point_score", "sample_mesh", "surface_score"]
@@ -80,7 +80,7 @@ def point_score(found_m: Float[np.ndarray, "found 3"], true_m: Float[np.ndarray,
 
 
 def surface_score(
-    mesh: SurfaceMesh, truth: ObjectSurface, samples: int, rng: np.random.Generator
+    mesh: SurfaceMesh, truth: SurfaceTarget, samples: int, rng: np.random.Generator
 ) -> SurfaceScore:
     """Score of a mesh in the canonical frame."""
     found = sample_mesh(mesh, samples, rng)

@@ -1,1 +1,1 @@
-"""From pictures to a reconstruction with trained networks of both stages, and the files of one."""
+"""From images to a reconstruction with trained networks of both stages, and the files of one."""

@@ -44,9 +44,9 @@ def first_crops(frames: VideoFrames, boxes_px: Sequence[Float[np.ndarray, "4"]] 
 def cropped(
     frames: VideoFrames, crops: Sequence[FrameCrop], size: int
 ) -> tuple[Float32[np.ndarray, "view 3 size size"], tuple[SquareWindow, ...]]:
-    """Pictures of `size` px, sRGB 0..1, and where they lie."""
+    """Images of `size` px, sRGB 0..1, and where they lie."""
     pairs = [square_crop(f.image, crop.box_px, size) for f, crop in zip(frames.frames, crops, strict=True)]
-    return np.stack([picture for picture, _ in pairs]), tuple(window for _, window in pairs)
+    return np.stack([image for image, _ in pairs]), tuple(window for _, window in pairs)
 
 
 def closer_crop(
@@ -71,7 +71,7 @@ def closer_crop(
 def hand_regions(
     network: HandNet, images: Float[Tensor, "view 3 size size"]
 ) -> list[Bool[np.ndarray, "size size"]]:
-    """Convex hull of the 21 joints in each picture, empty where no hand is seen.
+    """Convex hull of the 21 joints in each image, empty where no hand is seen.
 
     The hand's mask would do for a hand alone, but it takes in the forearm, which a crop need not hold.
     """

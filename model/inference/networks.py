@@ -67,7 +67,7 @@ class StageTwoRun:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StageOneNetworks:
-    """Stage 1, and the pictures that it was trained on."""
+    """Stage 1, and the images that it was trained on."""
 
     task: StageOneTask
     hand: HandNet  # finds the joints that a crop must hold
@@ -77,7 +77,7 @@ class StageOneNetworks:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StageTwoNetworks:
-    """Stage 2, and the pictures that it was trained on."""
+    """Stage 2, and the images that it was trained on."""
 
     task: SlatFlowTask
     image_size: int  # px

@@ -1,4 +1,4 @@
-"""reconstruct: pictures of a hand that holds an object to amodal masks, voxels and a closed coloured mesh."""
+"""reconstruct: images of a hand that holds an object to amodal masks, voxels and a closed coloured mesh."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from model.inference.crops import CloserCrop, FrameCrop, closer_crop, first_crop
 from model.inference.networks import Networks, StageTwoNetworks
 from model.inference.stage_clock import StageClock
 from model.inference.stages import run_stage_one, run_stage_two
-from model.surface.watertight_mesh import SolidConfig, SolidSurface, solid_surface
+from model.surface.watertight_mesh import ExtractedSurface, SurfaceExtractionConfig, extracted_surface
 from model.video.frame_choice import FrameChoice, choose_frames
 from model.video.frames import VideoFrame, VideoFrames
 from model.video.square_crop import SquareWindow
@@ -27,7 +27,7 @@ class ReconstructionSettings:
     seed: int  # of the noise that is denoised; 0 or more
     views: int | None  # informative frames to choose of those given; None: all of them
     closer_crop: CloserCrop | None  # None: one pass, on the first squares
-    min_component_share: float  # as in SolidConfig, all three
+    min_component_share: float  # as in SurfaceExtractionConfig, all three
     max_faces: int
     max_simplification_move: float
 
@@ -53,7 +53,7 @@ class Reconstruction:
     images: Float32[np.ndarray, "view 3 size size"]  # crops as stage 1 saw them, sRGB 0..1
     masks: Float32[np.ndarray, "view size size"]  # amodal object mask on the crops, probability
     occupancy: Bool[np.ndarray, "64 64 64"]  # [i, j, k] along x, y, z
-    surface: SolidSurface | None  # None without stage 2
+    surface: ExtractedSurface | None  # None without stage 2
     seed: int
     seconds: Mapping[str, float]  # wall clock, by stage
     notes: tuple[str, ...]  # what the user should know
@@ -65,7 +65,7 @@ class Reconstruction:
 
 
 def frames_of_images(images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> VideoFrames:
-    """Upright sRGB pictures in memory, as `reconstruct` takes them. ModelError when there is none."""
+    """Upright sRGB images in memory, as `reconstruct` takes them. ModelError when there is none."""
     frames = tuple(
         VideoFrame(
             image=image,
@@ -77,7 +77,7 @@ def frames_of_images(images: Sequence[UInt8[np.ndarray, "_ _ 3"]]) -> VideoFrame
         )
         for i, image in enumerate(images)
     )
-    return VideoFrames(source="images", kind="pictures", frames=frames, n_source_frames=len(frames), notes=())
+    return VideoFrames(source="images", kind="images", frames=frames, n_source_frames=len(frames), notes=())
 
 
 def reconstruct(
@@ -118,7 +118,7 @@ def reconstruct(
         with clock.stage("stage 2: structured latents"):
             fields = run_stage_two(frames, crops, one.occupancy, two, networks.device, settings.seed)
         with clock.stage("mesh"):
-            surface = solid_surface(fields, _solid_config(settings, two))
+            surface = extracted_surface(fields, _extraction_config(settings, two))
     return Reconstruction(
         frames=frames,
         choice=choice,
@@ -147,9 +147,9 @@ def _closer_crops(
     ]
 
 
-def _solid_config(settings: ReconstructionSettings, stage: StageTwoNetworks) -> SolidConfig:
+def _extraction_config(settings: ReconstructionSettings, stage: StageTwoNetworks) -> SurfaceExtractionConfig:
     """Surfaces are taken as they were when the decoder was measured."""
-    return SolidConfig(
+    return SurfaceExtractionConfig(
         extraction=stage.task.evaluation.extraction,
         min_component_share=settings.min_component_share,
         max_faces=settings.max_faces,

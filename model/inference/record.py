@@ -98,7 +98,7 @@ def _surface(result: Reconstruction) -> dict[str, Any] | None:
     mesh = result.surface.mesh
     sides = mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
     return asdict(result.surface.report) | {
-        "watertight_manifold": True,  # solid_surface raises otherwise
+        "watertight_manifold": True,  # extracted_surface raises otherwise
         "bounding_box_sides": sides.round(4).tolist(),
         "exposed_corners": result.surface.exposed_corners,
         "uncolored_vertices": result.surface.uncolored_vertices,

@@ -51,7 +51,7 @@ def write_result(result: Reconstruction, folder: Path) -> None:
 def _sheet(
     result: Reconstruction, blocks: SurfaceMesh, turn: UInt8[np.ndarray, "frame size size 3"] | None
 ) -> UInt8[np.ndarray, "height width 3"]:
-    """A row per frame: picture, crop, mask; then voxels and surface from three sides."""
+    """A row per frame: image, crop, mask; then voxels and surface from three sides."""
     rows = []
     for frame, crop, image, mask in zip(result.frames.frames, result.crops, result.images, result.masks):
         plain = np.round(255 * image.transpose(1, 2, 0)).astype(np.uint8)
@@ -70,8 +70,8 @@ def _sheet(
     return contact_sheet(rows, _TILE_PX)
 
 
-def _three_sides(pictures: UInt8[np.ndarray, "three size size 3"], label: str) -> list[Tile]:
+def _three_sides(images: UInt8[np.ndarray, "three size size 3"], label: str) -> list[Tile]:
     return [
-        Tile(image=picture, label=label if i == 0 else f"turned by {120 * i} degrees")
-        for i, picture in enumerate(pictures)
+        Tile(image=image, label=label if i == 0 else f"turned by {120 * i} degrees")
+        for i, image in enumerate(images)
     ]

@@ -1,4 +1,4 @@
-"""The size of an object where its source says it; pictures alone do not."""
+"""The size of an object where its source says it; images alone do not."""
 
 from dataclasses import dataclass
 
@@ -26,4 +26,4 @@ def known_scale(frames: VideoFrames) -> KnownScale | None:
     uid = clips["object_uid"][clips["clip_id"].index(clip_id)]
     objects = shard.read_objects(("object_uid", "object_scale_m"))
     metres = float(objects["object_scale_m"][objects["object_uid"].index(uid)])
-    return KnownScale(metres_per_unit=metres, origin="annotation of the dataset, not the pictures")
+    return KnownScale(metres_per_unit=metres, origin="annotation of the dataset, not the images")

@@ -1,6 +1,6 @@
-"""Training one part of a configuration: its streams, the trainer, its figures.
+"""Training one part of a configuration: its streams, the trainer, its metrics.
 
-RUN/<part>    checkpoints, TensorBoard logs, figures.json
+RUN/<part>    checkpoints, TensorBoard logs, metrics.json
 """
 
 import json
@@ -87,7 +87,7 @@ def run_part(
     accelerator: Accelerator,
     report: Callable[[StepReport], None],
 ) -> dict[str, float]:
-    """Train to the end, from where it was stopped, and give the figures of the last validation."""
+    """Train to the end, from where it was stopped, and give the metrics of the last validation."""
     last: list[Evaluation] = []
 
     def validate() -> Evaluation:
@@ -106,14 +106,14 @@ def run_part(
         report=report,
         accelerator=accelerator,
     )
-    path = folder / "figures.json"
-    if not last and not path.exists():  # stopped between the last checkpoint and the figures
+    path = folder / "metrics.json"
+    if not last and not path.exists():  # stopped between the last checkpoint and the metrics
         load_part(folder, task.module, config_sha256=config_sha256)
         validate()
     if last and accelerator.is_main_process:
-        _write_figures(path, last[0].figures)
+        _write_metrics(path, last[0].metrics)
     accelerator.wait_for_everyone()
-    return _read_figures(path)
+    return _read_metrics(path)
 
 
 def require_same_data(folder: Path, data: PartData) -> None:
@@ -124,7 +124,7 @@ def require_same_data(folder: Path, data: PartData) -> None:
 
 
 def _evaluation(task: Task, data: PartData, accelerator: Accelerator) -> Evaluation:
-    """The same figures on every rank, and on any number of ranks."""
+    """The same metrics on every rank, and on any number of ranks."""
     if not isinstance(task, SharedValidation):  # e.g. counts an object once however many batches show it
         return task.evaluate(data.validation(accelerator.device))
     rank, ranks = accelerator.process_index, accelerator.num_processes
@@ -133,16 +133,16 @@ def _evaluation(task: Task, data: PartData, accelerator: Accelerator) -> Evaluat
     for of_rank in gather_object([measured.numbers]):
         for name, values in of_rank.items():
             numbers.setdefault(name, []).extend(values)
-    return replace(measured, numbers=numbers).evaluation()  # pictures: those of the first rank are logged
+    return replace(measured, numbers=numbers).evaluation()  # images: those of the first rank are logged
 
 
-def _write_figures(path: Path, figures: dict[str, float]) -> None:
+def _write_metrics(path: Path, metrics: dict[str, float]) -> None:
     """JSON has no NaN and no infinity: null where nothing was there to measure."""
-    held = {name: value if math.isfinite(value) else None for name, value in figures.items()}
+    held = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
     path.write_text(json.dumps(held, indent=2, allow_nan=False), encoding="utf-8")
 
 
-def _read_figures(path: Path) -> dict[str, float]:
+def _read_metrics(path: Path) -> dict[str, float]:
     held = json.loads(path.read_text(encoding="utf-8"))
     return {name: math.nan if value is None else value for name, value in held.items()}
 

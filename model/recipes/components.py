@@ -1,7 +1,7 @@
 """The parts of stage 1, trained one after the other: VAE, hand encoder, dual-branch flow.
 
-RUN/vae, RUN/hand_encoder, RUN/stage_one    checkpoints, TensorBoard logs, figures.json
-RUN/stage_one/facts.safetensors    what stage 1 needs of the training data when it is used
+RUN/vae, RUN/hand_encoder, RUN/stage_one    checkpoints, TensorBoard logs, metrics.json
+RUN/stage_one/dataset_statistics.safetensors    what stage 1 needs of the training data when it is used
 RUN/hand_encoder/hand_encoder.{safetensors,json}    its averaged weights in float16, for `load_hand_net`
 """
 
@@ -33,7 +33,7 @@ from model.recipes.config import (
     VaePart,
     as_yaml,
 )
-from model.recipes.dataset_statistics import TrainingFacts, facts_of_run, load_facts
+from model.recipes.dataset_statistics import DatasetStatistics, load_statistics, statistics_of_run
 from model.recipes.frozen_encoders import aggregator_over, given_hand_encoder, image_encoder, with_cache
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
@@ -63,7 +63,7 @@ def train_part(
     accelerator: Accelerator,
     report: Callable[[StepReport], None],
 ) -> dict[str, float]:
-    """Train one part (see PARTS) and give its figures on held-out cameras. Earlier parts must be trained.
+    """Train one part (see PARTS) and give its metrics on held-out cameras. Earlier parts must be trained.
 
     Continues where it was stopped. ModelError when an earlier part is missing, of another configuration or of
     other data.
@@ -73,7 +73,7 @@ def train_part(
     for earlier in trained_parts(config)[: trained_parts(config).index(name)]:
         require_same_data(folder / earlier, data)
     task = _task(name, config, folder, accelerator.device)
-    figures = run_part(
+    metrics = run_part(
         task,
         data,
         recipe,
@@ -85,7 +85,7 @@ def train_part(
     )
     if isinstance(task, HandTask) and accelerator.is_main_process:
         _export_hand_net(task.network, config, folder)
-    return figures
+    return metrics
 
 
 def _export_hand_net(network: HandNet, config: TrainingConfig, folder: Path) -> None:
@@ -99,7 +99,7 @@ def _export_hand_net(network: HandNet, config: TrainingConfig, folder: Path) -> 
 
 def load_stage_one(config: TrainingConfig, folder: Path, device: torch.device) -> StageOneTask:
     """Stage 1 with the averaged weights of its newest checkpoint, for inference."""
-    task = _stage_one_task(config, folder, device, load_facts(folder / "stage_one"))
+    task = _stage_one_task(config, folder, device, load_statistics(folder / "stage_one"))
     _load(folder, "stage_one", config, task.module)
     task.module.to(device).eval()
     return task
@@ -130,13 +130,13 @@ def _task(name: str, config: TrainingConfig, folder: Path, device: torch.device)
 
 
 def _stage_one_task(
-    config: TrainingConfig, folder: Path, device: torch.device, facts: TrainingFacts | None
+    config: TrainingConfig, folder: Path, device: torch.device, statistics: DatasetStatistics | None
 ) -> StageOneTask:
-    """`facts` None: those of a run that begins or goes on, measured once on the training data."""
+    """`statistics` None: those of a run that begins or goes on, measured once on the training data."""
     part = config.stage_one
     vae = _vae(config, folder).to(device)
-    if facts is None:
-        facts = facts_of_run(folder / "stage_one", lambda: _measured(config, vae, device))
+    if statistics is None:
+        statistics = statistics_of_run(folder / "stage_one", lambda: _measured(config, vae, device))
     image, hand = image_encoder(config.encoders), _hand_encoder(config, folder)
     image.to(device, torch.float32)
     hand.to(device, torch.float32)
@@ -160,9 +160,9 @@ def _stage_one_task(
             time=part.time,
             sampler=part.sampler,
             guidance=Guidance(strength={"geometry": part.guidance_strength}, interval=part.guidance_interval),
-            latent_scale=facts.latent_scale,
+            latent_scale=statistics.latent_scale,
         ),
-        mean_shape=facts.mean_shape,
+        mean_shape=statistics.mean_shape,
     )
 
 
@@ -184,9 +184,9 @@ def _vae(config: TrainingConfig, folder: Path) -> StructureVae:
     return vae.eval().requires_grad_(False)
 
 
-def _measured(config: TrainingConfig, vae: StructureVae, device: torch.device) -> TrainingFacts:
+def _measured(config: TrainingConfig, vae: StructureVae, device: torch.device) -> DatasetStatistics:
     shapes, start = _training_shapes(config), config.stage_one.start
-    return TrainingFacts(
+    return DatasetStatistics(
         latent_scale=start.latent_scale if start else _latent_scale(vae, shapes, device),
         mean_shape=mean_shape(shapes),
     )

@@ -101,11 +101,11 @@ class PackagedHandEncoder:
 
 @dataclass(frozen=True, kw_only=True)
 class EncodersConfig:
-    """Frozen encoders of the pictures."""
+    """Frozen encoders of the images."""
 
     image: EfficientNetConfig | DinoConfig
     hand: OwnHandEncoder | PackagedHandEncoder | WilorConfig
-    cached_views: int  # pictures whose features are kept; of use where crops repeat, 0: none
+    cached_views: int  # images whose features are kept; of use where crops repeat, 0: none
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,7 +138,7 @@ class StageOnePart:
 
 @dataclass(frozen=True, kw_only=True)
 class ValidationConfig:
-    """What the figures while training are measured on.
+    """What the metrics while training are measured on.
 
     `split`: that of the training for held-out cameras of its motions, another one for all cameras of objects
     that were never trained on.
@@ -191,7 +191,7 @@ class TrainingConfig:
 
 
 def require_held_out(data: StreamConfig, validation: ValidationConfig) -> None:
-    """ValueError: data that end, or figures on what is trained on."""
+    """ValueError: data that end, or metrics on what is trained on."""
     if not data.endless:
         raise ValueError(
             "data.endless is false: training draws batches for as many steps as it takes; expected true"
@@ -199,7 +199,7 @@ def require_held_out(data: StreamConfig, validation: ValidationConfig) -> None:
     if validation.split == data.split and data.cameras != "train":
         raise ValueError(
             f"validation.split is that of the training and data.cameras is {data.cameras}: expected cameras: train, "
-            "so that figures are of cameras that were not trained on, or another split"
+            "so that metrics are of cameras that were not trained on, or another split"
         )
 
 

@@ -13,36 +13,36 @@ from torch import Tensor
 from model.errors import ModelError
 from model.tensor_files.safetensors_file import write_tensors
 
-__all__ = ["TrainingFacts", "facts_of_run", "load_facts"]
+__all__ = ["DatasetStatistics", "load_statistics", "statistics_of_run"]
 
-_FILE = "facts.safetensors"
+_FILE = "dataset_statistics.safetensors"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TrainingFacts:
+class DatasetStatistics:
     """Measured once, before the first step."""
 
     latent_scale: float  # latents are divided by it
     mean_shape: Bool[Tensor, "64 64 64"]  # of the training objects
 
 
-def facts_of_run(folder: Path, measure: Callable[[], TrainingFacts]) -> TrainingFacts:
+def statistics_of_run(folder: Path, measure: Callable[[], DatasetStatistics]) -> DatasetStatistics:
     """Those of a run that goes on, or of one that begins: measured and written."""
     if (folder / _FILE).exists():
-        return load_facts(folder)
-    facts = measure()
-    scale = torch.tensor(facts.latent_scale, dtype=torch.float64)
+        return load_statistics(folder)
+    statistics = measure()
+    scale = torch.tensor(statistics.latent_scale, dtype=torch.float64)
     # Every rank measures, and writes, the same.
-    write_tensors(folder / _FILE, {"latent_scale": scale, "mean_shape": facts.mean_shape})
-    return facts
+    write_tensors(folder / _FILE, {"latent_scale": scale, "mean_shape": statistics.mean_shape})
+    return statistics
 
 
-def load_facts(folder: Path) -> TrainingFacts:
+def load_statistics(folder: Path) -> DatasetStatistics:
     """ModelError when they are missing or broken."""
     path = folder / _FILE
     try:
         tensors = load_file(path)
-        return TrainingFacts(
+        return DatasetStatistics(
             latent_scale=float(tensors["latent_scale"]), mean_shape=tensors["mean_shape"].bool()
         )
     except (OSError, SafetensorError, KeyError) as error:

@@ -1,4 +1,4 @@
-"""The frozen encoders of pictures and hands that a configuration names, and the trained aggregator over them."""
+"""The frozen encoders of images and hands that a configuration names, and the trained aggregator over them."""
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.cached import CachedEncoder
@@ -55,5 +55,5 @@ def aggregator_over(
 
 
 def with_cache(encoder: FeatureEncoder, config: EncodersConfig) -> FeatureEncoder:
-    """Keeps the features of `cached_views` pictures, of use where crops repeat."""
+    """Keeps the features of `cached_views` images, of use where crops repeat."""
     return CachedEncoder(encoder=encoder, max_views=config.cached_views) if config.cached_views else encoder

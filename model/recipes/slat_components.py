@@ -1,6 +1,6 @@
 """The parts of stage 2, trained one after the other: structured-latent VAE, structured-latent flow.
 
-RUN/slat_vae, RUN/slat_flow    checkpoints, TensorBoard logs, figures.json
+RUN/slat_vae, RUN/slat_flow    checkpoints, TensorBoard logs, metrics.json
 """
 
 from collections.abc import Callable, Iterator
@@ -56,7 +56,7 @@ def train_slat_part(
     accelerator: Accelerator,
     report: Callable[[StepReport], None],
 ) -> dict[str, float]:
-    """Train one part (see SLAT_PARTS) and give its figures on held-out views. The VAE comes first.
+    """Train one part (see SLAT_PARTS) and give its metrics on held-out views. The VAE comes first.
 
     Continues where it was stopped. ModelError when the VAE is missing, of another configuration or of other data.
     """

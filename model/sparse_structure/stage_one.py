@@ -35,7 +35,7 @@ from model.sparse_structure.vae import StructureVae, occupancy_from_logits
 from model.training.step_generators import normal_like, uniform
 from model.training.task import Evaluation, Losses, Measurements
 
-FIGURES = (
+METRICS = (
     "voxel_iou",
     "mean_shape_iou",  # of the mean training shape, for every object
     "chamfer",  # share of the cube's side; of an empty shape, the cube's diagonal
@@ -49,7 +49,7 @@ FIGURES = (
 )
 OCCLUDED = 0.2
 
-__all__ = ["FIGURES", "StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
+__all__ = ["METRICS", "StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,22 +156,22 @@ class StageOneTask:
         return Prediction(occupancy=occupancy_from_logits(logits), masks=clean["masks"][:, :, 0])
 
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Means of FIGURES over samples or views; a figure without views is NaN."""
+        """Means of FIGURES over samples or views; a metric without views is NaN."""
         return self.measure(batches).evaluation()
 
     @torch.no_grad()
     def measure(self, batches: Iterable[Batch]) -> Measurements:
         """FIGURES of every sample or view, with noise that belongs to the batch."""
-        numbers: dict[str, list[float]] = {name: [] for name in FIGURES}
-        pictures: dict[str, np.ndarray] = {}
+        numbers: dict[str, list[float]] = {name: [] for name in METRICS}
+        images: dict[str, np.ndarray] = {}
         for batch in batches:
             found = self.predict(batch.images, _noise_of(batch))
             scores = _shape_scores(batch, found, self.mean_shape) | _mask_scores(batch, found, self.hand_net)
             for name, values in scores.items():
                 numbers[name] += values.tolist()
-            if not pictures:
-                pictures = {"prediction": prediction_rows(batch, found)}
-        return Measurements(numbers=numbers, pictures=pictures)
+            if not images:
+                images = {"prediction": prediction_rows(batch, found)}
+        return Measurements(numbers=numbers, images=images)
 
 
 def _noise_of(batch: Batch) -> torch.Generator:

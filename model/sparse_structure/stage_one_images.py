@@ -6,7 +6,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from model.data.batch import Batch
-from model.evaluation.voxel_image import voxel_picture
+from model.evaluation.voxel_image import voxel_image
 from model.sparse_structure.prediction import Prediction
 
 __all__ = ["prediction_rows"]
@@ -28,7 +28,7 @@ def prediction_rows(batch: Batch, found: Prediction) -> UInt8[np.ndarray, "heigh
                 _grey(batch.object_amodal[s, v].float()),
             ]
             tiles.append(_grey((found.masks[s, v].float() + 1.0) / 2.0))
-        tiles += [voxel_picture(batch.occupancy[s], TILE), voxel_picture(found.occupancy[s], TILE)]
+        tiles += [voxel_image(batch.occupancy[s], TILE), voxel_image(found.occupancy[s], TILE)]
         rows.append(np.concatenate(tiles, axis=1))
     return np.concatenate(rows, axis=0)
 

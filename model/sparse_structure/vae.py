@@ -209,9 +209,9 @@ def vae_loss(
     Sums run over one sample (TRELLIS: over the batch), so ranks that share a batch agree with one process.
     """
     probability = logits.float().sigmoid().flatten(1)
-    solid = occupancy.float().flatten(1)
-    overlap = 2 * (probability * solid).sum(1) + 1
-    dice = 1 - overlap / (probability.sum(1) + solid.sum(1) + 1)
+    occupied = occupancy.float().flatten(1)
+    overlap = 2 * (probability * occupied).sum(1) + 1
+    dice = 1 - overlap / (probability.sum(1) + occupied.sum(1) + 1)
     mean, logvar = latent.mean.float().flatten(1), latent.logvar.float().flatten(1)
     kl = 0.5 * (mean.square() + logvar.exp() - logvar - 1).mean(1)
     return VaeLoss(total=(dice + KL_WEIGHT * kl).mean(), dice=dice, kl=kl)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from model.data.batch import Batch
 from model.evaluation.overlap import intersection_over_union
-from model.evaluation.voxel_image import voxel_picture
+from model.evaluation.voxel_image import voxel_image
 from model.sparse_structure.vae import StructureVae, VaeConfig, occupancy_from_logits
 from model.training.step_generators import normal_like, uniform
 from model.training.task import Evaluation, Losses, Measurements
@@ -55,21 +55,21 @@ class VaeTask:
         return Losses(total=losses.total, parts={"dice": losses.dice.mean(), "kl": losses.kl.mean()})
 
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """voxel_iou of shapes through encoder and decoder; pictures: truth beside reconstruction."""
+        """voxel_iou of shapes through encoder and decoder; images: truth beside reconstruction."""
         return self.measure(batches).evaluation()
 
     @torch.no_grad()
     def measure(self, batches: Iterable[Batch]) -> Measurements:
         """voxel_iou of every shape."""
         scores: list[float] = []
-        pictures: dict[str, np.ndarray] = {}
+        images: dict[str, np.ndarray] = {}
         for batch in batches:
             decoded = occupancy_from_logits(self.network.decoder(self.network.encoder(batch.occupancy).mean))
             scores += intersection_over_union(decoded, batch.occupancy).tolist()
-            if not pictures:
+            if not images:
                 rows = [
-                    np.concatenate([voxel_picture(truth), voxel_picture(found)], axis=1)
+                    np.concatenate([voxel_image(truth), voxel_image(found)], axis=1)
                     for truth, found in zip(batch.occupancy.cpu(), decoded.cpu())
                 ]
-                pictures = {"truth_and_reconstruction": np.concatenate(rows[:4], axis=0)}
-        return Measurements(numbers={"voxel_iou": scores}, pictures=pictures)
+                images = {"truth_and_reconstruction": np.concatenate(rows[:4], axis=0)}
+        return Measurements(numbers={"voxel_iou": scores}, images=images)

@@ -57,7 +57,7 @@ class SlatFlowTask:
     vae: SlatVae  # frozen
     config: SlatFlowTraining
     evaluation: MeshEvaluationConfig
-    inputs: ObjectInputs  # of the true objects, for training and figures
+    inputs: ObjectInputs  # of the true objects, for training and metrics
 
     @property
     def module(self) -> nn.Module:
@@ -144,12 +144,10 @@ class SlatFlowTask:
             for index, (uid, truth) in enumerate(zip(uids, truths)):
                 found.append(scored_mesh(prediction.decoded, index, truth, self.evaluation))
                 rows.append((truth, (found[-1].mesh, baseline[uid].mesh, ceiling[uid].mesh)))
-        figures = mean_scores(found) | {"latent_error": float(np.mean(errors)) if errors else float("nan")}
-        figures |= _named("mean_latent", mean_scores(list(baseline.values())))
-        figures |= _named("true_latent", mean_scores(list(ceiling.values())))
-        return Evaluation(
-            figures=figures, pictures={"truth_sampled_mean_latent_true_latent": comparison(rows)}
-        )
+        metrics = mean_scores(found) | {"latent_error": float(np.mean(errors)) if errors else float("nan")}
+        metrics |= _named("mean_latent", mean_scores(list(baseline.values())))
+        metrics |= _named("true_latent", mean_scores(list(ceiling.values())))
+        return Evaluation(metrics=metrics, images={"truth_sampled_mean_latent_true_latent": comparison(rows)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,5 +164,5 @@ class _Velocity:
         return {LATENT: self.network(x_t, of_sample, self.condition).features.float()}
 
 
-def _named(prefix: str, figures: Mapping[str, float]) -> dict[str, float]:
-    return {f"{prefix}_{name}": value for name, value in figures.items()}
+def _named(prefix: str, metrics: Mapping[str, float]) -> dict[str, float]:
+    return {f"{prefix}_{name}": value for name, value in metrics.items()}

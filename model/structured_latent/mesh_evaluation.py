@@ -1,4 +1,4 @@
-"""From decoded voxels to meshes, their scores and their pictures."""
+"""From decoded voxels to meshes, their scores and their images."""
 
 import math
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from model.data.batch import ObjectSurface
+from model.data.batch import SurfaceTarget
 from model.errors import ModelError
 from model.evaluation.surface import SurfaceScore, surface_score
 from model.networks.sparse.tensor import SparseTensor
@@ -38,7 +38,7 @@ class ScoredMesh:
 
 
 def scored_mesh(
-    decoded: SparseTensor, sample: int, truth: ObjectSurface, config: MeshEvaluationConfig
+    decoded: SparseTensor, sample: int, truth: SurfaceTarget, config: MeshEvaluationConfig
 ) -> ScoredMesh:
     """The surface of one sample against its truth; points on the mesh are drawn with a fixed seed."""
     largest_chamfer_cm = 100.0 * 2.0 * math.sqrt(3.0) * truth.object_scale_m

@@ -69,7 +69,7 @@ class SlatVaeTask:
 
     @torch.no_grad()
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Scores of the meshes of mean latents, every object once; pictures: truth beside reconstruction."""
+        """Scores of the meshes of mean latents, every object once; images: truth beside reconstruction."""
         meshes: dict[str, ScoredMesh] = {}
         rows = []
         for batch in batches:
@@ -81,8 +81,8 @@ class SlatVaeTask:
                     meshes[uid] = scored_mesh(decoded, index, truth, self.evaluation)
                     rows.append((truth, (meshes[uid].mesh,)))
         return Evaluation(
-            figures=mean_scores(list(meshes.values())),
-            pictures={"truth_and_reconstruction": comparison(rows)},
+            metrics=mean_scores(list(meshes.values())),
+            images={"truth_and_reconstruction": comparison(rows)},
         )
 
 

@@ -38,7 +38,7 @@ _EDGE_FACES = tuple({f for f, face in enumerate(_FACES) if set(edge[:2]) <= set(
 
 
 def edge_loops(case: int) -> list[list[int]]:
-    """Closed loops of crossed edges, counter-clockwise seen from outside the solid; bit c of `case` is corner c."""
+    """Closed loops of crossed edges, counter-clockwise seen from outside; bit c of `case` is corner c."""
     following: dict[int, int] = {}
     for face in _FACES:
         crossed = [

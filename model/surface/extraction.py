@@ -47,7 +47,7 @@ class _Crossings:
 def extract_surface(fields: SurfaceFields, config: ExtractionConfig) -> ExtractedSurface:
     """The closed surface between inside (distance < 0) and outside, canonical frame, outward.
 
-    Solids that reach beyond the cube are cut off at its sides. FlexiCubes weights are not used (fields.py says why).
+    Shapes that reach beyond the cube are cut off at its sides. FlexiCubes weights are not used (fields.py says why).
     ModelError: nothing is inside.
     """
     lattice = corner_lattice(fields, margin=config.seal + 1)

@@ -31,7 +31,7 @@ class SignedLattice:
     """A side for every corner of a lattice, covered or not."""
 
     inside: Bool[np.ndarray, "x y z"]
-    # Corners said to be inside next to uncovered ones that are outside: the voxels leave the solid open there.
+    # Corners said to be inside next to uncovered ones that are outside: the voxels leave the mesh open there.
     exposed_corners: int
 
 
@@ -77,8 +77,8 @@ def fill_uncovered(lattice: CornerLattice, seal: int) -> SignedLattice:
 
     Active voxels are a thin shell around a surface. TRELLIS calls every other corner outside (+1), so its meshes have
     a second, inner surface; here the space that a shell encloses takes the side that most of the covered corners
-    around it have, and the shell becomes one solid (or keeps a cavity, where the shell says so). `seal`: gaps of up to
-    2 seal corners in the shell do not let the outside in; the lattice needs a margin of at least seal + 1.
+    around it have, and the shell becomes one watertight mesh (or keeps a cavity, where the shell says so). `seal`: gaps
+    of up to 2 seal corners in the shell do not let the outside in; the lattice needs a margin of at least seal + 1.
     """
     covered = lattice.row >= 0
     inside = np.zeros(covered.shape, dtype=bool)

@@ -1,4 +1,4 @@
-"""A coloured triangle mesh, and the proof that it bounds a solid."""
+"""A coloured triangle mesh, and the proof that it bounds a watertight mesh."""
 
 from dataclasses import dataclass
 
@@ -46,22 +46,24 @@ def check_manifold(mesh: SurfaceMesh) -> MeshReport:
     """Closed, oriented, manifold, of positive volume, accepted by Manifold. ModelError names what is not so."""
     faces = mesh.faces
     if not len(faces):
-        raise _not_solid("it has no face")
+        raise _not_watertight("it has no face")
     if faces.min() < 0 or faces.max() >= len(mesh.vertices):
-        raise _not_solid(f"faces name vertices {faces.min()}..{faces.max()} of {len(mesh.vertices)}")
+        raise _not_watertight(f"faces name vertices {faces.min()}..{faces.max()} of {len(mesh.vertices)}")
     if not np.isfinite(mesh.vertices).all():
-        raise _not_solid(f"{np.count_nonzero(~np.isfinite(mesh.vertices).all(1))} vertices are not finite")
+        raise _not_watertight(
+            f"{np.count_nonzero(~np.isfinite(mesh.vertices).all(1))} vertices are not finite"
+        )
     _check_edges(faces)
     unused = len(mesh.vertices) - len(np.unique(faces))
     if unused:
-        raise _not_solid(f"{unused} vertices belong to no face")
+        raise _not_watertight(f"{unused} vertices belong to no face")
     rings = _vertex_rings(faces)
     if rings != len(mesh.vertices):
-        raise _not_solid(f"{rings - len(mesh.vertices)} vertices join sheets that touch in a point only")
+        raise _not_watertight(f"{rings - len(mesh.vertices)} vertices join sheets that touch in a point only")
     as_manifold(mesh)
     volume = float(face_volumes(mesh).sum())
     if volume <= 0.0:
-        raise _not_solid(f"its volume is {volume:.3g}: it is inside out")
+        raise _not_watertight(f"its volume is {volume:.3g}: it is inside out")
     components = int(face_components(faces).max()) + 1
     euler = len(mesh.vertices) - len(faces) // 2
     return MeshReport(
@@ -77,10 +79,12 @@ def check_manifold(mesh: SurfaceMesh) -> MeshReport:
 def as_manifold(mesh: SurfaceMesh) -> manifold3d.Manifold:
     """The mesh, without colours, for the Manifold library. ModelError: it does not take it."""
     vertices = np.array(mesh.vertices, order="C")  # Manifold refuses read-only arrays
-    solid = manifold3d.Manifold(manifold3d.Mesh(vertices, np.array(mesh.faces, dtype=np.uint32, order="C")))
-    if solid.status() != manifold3d.Error.NoError:
-        raise _not_solid(f"Manifold says {solid.status().name}")
-    return solid
+    watertight = manifold3d.Manifold(
+        manifold3d.Mesh(vertices, np.array(mesh.faces, dtype=np.uint32, order="C"))
+    )
+    if watertight.status() != manifold3d.Error.NoError:
+        raise _not_watertight(f"Manifold says {watertight.status().name}")
+    return watertight
 
 
 def face_components(faces: Int[np.ndarray, "face 3"]) -> Int32[np.ndarray, " face"]:
@@ -116,17 +120,17 @@ def vertex_normals(mesh: SurfaceMesh) -> Float32[np.ndarray, "vertex 3"]:
 def _check_edges(faces: Int32[np.ndarray, "face 3"]) -> None:
     start, stop = faces.astype(np.int64).reshape(-1), np.roll(faces, -1, axis=1).astype(np.int64).reshape(-1)
     if (start == stop).any():
-        raise _not_solid(f"{np.count_nonzero(start == stop)} faces use a vertex twice")
+        raise _not_watertight(f"{np.count_nonzero(start == stop)} faces use a vertex twice")
     size = int(faces.max()) + 1
     both = np.minimum(start, stop) * size + np.maximum(start, stop)
     _, inverse, times = np.unique(both, return_inverse=True, return_counts=True)
     if (times != 2).any():
-        raise _not_solid(
+        raise _not_watertight(
             f"{np.count_nonzero(times == 1)} edges have one face and {np.count_nonzero(times > 2)} more than two"
         )
     upward = np.bincount(inverse.reshape(-1), start < stop)
     if (upward != 1).any():
-        raise _not_solid(
+        raise _not_watertight(
             f"the two faces of {np.count_nonzero(upward != 1)} edges are turned against each other"
         )
 
@@ -144,7 +148,7 @@ def _vertex_rings(faces: Int32[np.ndarray, "face 3"]) -> int:
     return int(connected_components(graph, directed=False)[0])
 
 
-def _not_solid(problem: str) -> ModelError:
+def _not_watertight(problem: str) -> ModelError:
     return ModelError(
         "mesh",
         problem,

@@ -35,7 +35,7 @@ class Raster:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedMesh:
-    """One picture of a mesh."""
+    """One image of a mesh."""
 
     rgb: UInt8[np.ndarray, "height width 3"]
     depth: Float32[np.ndarray, "height width"]  # z in the camera frame, unit of T_cam_from_obj; 0 nothing

@@ -33,14 +33,14 @@ def simplify(mesh: SurfaceMesh, max_faces: int, max_move: float) -> SurfaceMesh:
     15 % below `max_faces`. Vertices keep their places and colours, so colours need vertices: few faces blur them.
     ModelError: not a manifold.
     """
-    solid = as_manifold(mesh)
+    watertight = as_manifold(mesh)
     if len(mesh.faces) <= max_faces:
         return mesh
-    found = solid
+    found = watertight
     low, high = np.log(1e-3 * max_move), np.log(max_move)
     at = high
     for _ in range(_ATTEMPTS):
-        coarser = solid.simplify(float(np.exp(at)))
+        coarser = watertight.simplify(float(np.exp(at)))
         if _nearer(coarser.num_tri(), found.num_tri(), max_faces):
             found = coarser
         if _GOOD_ENOUGH * max_faces <= found.num_tri() <= max_faces:

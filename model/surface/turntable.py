@@ -17,7 +17,7 @@ class TurntableConfig:
     """How the camera goes around the object."""
 
     frames: int
-    size_px: int  # pictures are square
+    size_px: int  # images are square
     supersampling: int  # rendered larger by this factor, then averaged
     fov_rad: float
     elevation_rad: float
@@ -25,7 +25,7 @@ class TurntableConfig:
 
 
 def turntable(mesh: SurfaceMesh, config: TurntableConfig) -> UInt8[np.ndarray, "frame size size 3"]:
-    """Pictures from cameras once around the up axis (+Z), the whole mesh in every one; sRGB."""
+    """Images from cameras once around the up axis (+Z), the whole mesh in every one; sRGB."""
     large = config.size_px * config.supersampling
     K = intrinsics_from_fov(config.fov_rad, (large, large))
     frames = []

@@ -1,4 +1,4 @@
-"""Decoded voxels to one checked solid: extraction, crumbs, simplification, proof."""
+"""Decoded voxels to one checked watertight mesh: extraction, crumbs, simplification, proof."""
 
 from dataclasses import dataclass
 
@@ -7,11 +7,11 @@ from model.surface.fields import SurfaceFields
 from model.surface.mesh import MeshReport, SurfaceMesh, check_manifold
 from model.surface.simplification import simplify, without_small_components
 
-__all__ = ["SolidConfig", "SolidSurface", "solid_surface"]
+__all__ = ["ExtractedSurface", "SurfaceExtractionConfig", "extracted_surface"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolidConfig:
+class SurfaceExtractionConfig:
     """From decoded voxels to the mesh that is handed out."""
 
     extraction: ExtractionConfig
@@ -21,7 +21,7 @@ class SolidConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolidSurface:
+class ExtractedSurface:
     """A mesh that passed `check_manifold`, and what was assumed and dropped for it."""
 
     mesh: SurfaceMesh
@@ -31,12 +31,12 @@ class SolidSurface:
     dropped_components: int
 
 
-def solid_surface(fields: SurfaceFields, config: SolidConfig) -> SolidSurface:
-    """Manifold, watertight, outward, in the canonical frame. ModelError: no voxel, nothing inside, no solid."""
+def extracted_surface(fields: SurfaceFields, config: SurfaceExtractionConfig) -> ExtractedSurface:
+    """Manifold, watertight, outward, in the canonical frame. ModelError: no voxel, nothing inside, not watertight."""
     extracted = extract_surface(fields, config.extraction)
     whole, dropped = without_small_components(extracted.mesh, config.min_component_share)
     mesh = simplify(whole, config.max_faces, config.max_simplification_move)
-    return SolidSurface(
+    return ExtractedSurface(
         mesh=mesh,
         report=check_manifold(mesh),
         exposed_corners=extracted.exposed_corners,

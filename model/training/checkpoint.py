@@ -101,7 +101,7 @@ def load_checkpoint(
     config_sha256: str,
     data_sha256: str,
 ) -> TrainingState:
-    """Restore everything, to the bit. ModelError when it is of another configuration, of other data, or damaged."""
+    """Restore everything, bit-exactly. ModelError when it is of another configuration, of other data, or damaged."""
     state = read_state(path)
     if state.config_sha256 != config_sha256:
         raise ModelError(

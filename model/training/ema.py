@@ -33,7 +33,7 @@ class MovingAverage:
 
     @torch.no_grad()
     def swap(self, module: nn.Module) -> None:
-        """Exchange averages and parameters; a second call takes it back, to the bit."""
+        """Exchange averages and parameters; a second call takes it back, bit-exactly."""
         for name, parameter in module.named_parameters():
             if name in self.averages:
                 current = parameter.detach().to(torch.float32, copy=True)

@@ -25,18 +25,18 @@ class Losses:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
-    """Figures and pictures of a validation run. A figure that nothing was there for is NaN."""
+    """Metrics and images of a validation run. A metric that nothing was there for is NaN."""
 
-    figures: dict[str, float]
-    pictures: dict[str, UInt8[np.ndarray, "height width 3"]]
+    metrics: dict[str, float]
+    images: dict[str, UInt8[np.ndarray, "height width 3"]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Measurements:
-    """What was found on some of the validation batches: numbers whose means are the figures, pictures of the first."""
+    """What was found on some of the validation batches: numbers whose means are the metrics, images of the first."""
 
     numbers: dict[str, list[float]]
-    pictures: dict[str, UInt8[np.ndarray, "height width 3"]]
+    images: dict[str, UInt8[np.ndarray, "height width 3"]]
 
     def evaluation(self) -> Evaluation:
         """The means, which do not depend on the order of the numbers."""
@@ -44,7 +44,7 @@ class Measurements:
             name: math.fsum(values) / len(values) if values else math.nan
             for name, values in self.numbers.items()
         }
-        return Evaluation(figures=means, pictures=self.pictures)
+        return Evaluation(metrics=means, images=self.images)
 
 
 @runtime_checkable
@@ -59,12 +59,12 @@ class Task(Protocol):
         """Loss of a batch. All randomness comes from the generators, one per sample (`draws.py`)."""
 
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Figures with the weights that the module holds now; no gradients, randomness of its own fixed seed."""
+        """Metrics with the weights that the module holds now; no gradients, randomness of its own fixed seed."""
 
 
 @runtime_checkable
 class SharedValidation(Protocol):
-    """A Task whose validation ranks share: each measures some batches, and the figures are means over all of them."""
+    """A Task whose validation ranks share: each measures some batches, and the metrics are means over all of them."""
 
     def measure(self, batches: Iterable[Batch]) -> Measurements:
-        """Numbers of every figure, which depend on their batch alone; as for `evaluate`, which gives their means."""
+        """Numbers of every metric, which depend on their batch alone; as for `evaluate`, which gives their means."""

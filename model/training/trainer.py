@@ -111,7 +111,7 @@ def train(
     """Train to the end, from the newest checkpoint in `folder` if there is one.
 
     `validate` is called with the averaged weights in place. Raises NonFiniteLossError, and
-    TrainingStopped after SIGTERM; both leave a checkpoint to go on from. However it ends, the log is
+    TrainingStopped after SIGTERM; both leave a checkpoint to resume from. However it ends, the log is
     written and the loader processes are gone.
     """
     accelerator = accelerator or Accelerator()
@@ -245,7 +245,7 @@ def _step(
         raise NonFiniteLossError(
             f"step {step}: the gradient is {float(norm)} though the loss is finite; samples of this rank: "
             f"{', '.join(ids)}; expected a finite number. Look at these samples, or lower optimizer.learning_rate; "
-            f"training goes on from the newest checkpoint in {run.checkpoints}"
+            f"training resumes from the newest checkpoint in {run.checkpoints}"
         )
     rate = run.optimizer_config.rate(step, config.steps)
     for group in run.optimizer.param_groups:
@@ -279,7 +279,7 @@ def _require_finite(run: _Run, losses: Losses, batch: Batch, step: int) -> None:
     whose = f"samples {', '.join(batch.ids)}" if bad else "samples of another rank (see its message)"
     raise NonFiniteLossError(
         f"step {step}: the loss is {float(losses.total.detach())} ({parts}) for {whose}; expected a finite number. "
-        f"Look at these samples, or lower optimizer.learning_rate; training goes on from the newest checkpoint "
+        f"Look at these samples, or lower optimizer.learning_rate; training resumes from the newest checkpoint "
         f"in {run.checkpoints}"
     )
 
@@ -293,11 +293,11 @@ def _validate(run: _Run, step: int, validate: Callable[[], Evaluation]) -> None:
     finally:
         run.average.swap(run.task.module)
     if run.writer is not None:
-        for name, value in evaluation.figures.items():
+        for name, value in evaluation.metrics.items():
             if math.isfinite(value):  # else nothing was there to measure
                 run.writer.add_scalar(f"validation/{name}", value, step)
-        for name, picture in evaluation.pictures.items():
-            run.writer.add_image(f"validation/{name}", picture, step, dataformats="HWC")
+        for name, image in evaluation.images.items():
+            run.writer.add_image(f"validation/{name}", image, step, dataformats="HWC")
 
 
 def _log(

@@ -1,4 +1,4 @@
-"""Pictures that show a reconstruction at a glance, and the mask files."""
+"""Images that show a reconstruction at a glance, and the mask files."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ _PAPER, _INK = (24, 24, 24), (235, 235, 235)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Tile:
-    """One picture of a sheet with a line of text below it."""
+    """One image of a sheet with a line of text below it."""
 
     image: UInt8[np.ndarray, "height width 3"]
     label: str

@@ -16,7 +16,7 @@ from model.video.frames import VideoFrames, scaled_down
 
 __all__ = ["FrameChoice", "choose_frames", "relative_sharpness"]
 
-_THUMBNAIL_PX = 32  # side of the pictures that are compared
+_THUMBNAIL_PX = 32  # side of the images that are compared
 _SHARPNESS_SIDE_PX = 512  # longest side: a blur that the encoders could not see does not count
 _NOISE_SIGMA_PX = 1.0
 _NEIGHBOURS = 4  # on each side; sharpness is compared within them, because it depends on what is shown
@@ -93,11 +93,11 @@ def relative_sharpness(
 def _laplacian_energy(
     image: UInt8[np.ndarray, "height width 3"], changed: Float32[np.ndarray, "thumb thumb"]
 ) -> float:
-    """Mean squared Laplacian of the smoothed luminance, weighted by where the picture changed."""
+    """Mean squared Laplacian of the smoothed luminance, weighted by where the image changed."""
     small = scaled_down(image, _SHARPNESS_SIDE_PX)
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY).astype(np.float32)
     laplacian = cv2.Laplacian(cv2.GaussianBlur(grey, (0, 0), _NOISE_SIGMA_PX), cv2.CV_32F)
-    # A floor lets the whole picture count where nothing moves, and a little elsewhere.
+    # A floor lets the whole image count where nothing moves, and a little elsewhere.
     weight: np.ndarray = changed + np.float32(0.05 * changed.max() + 1e-3)
     weights = cv2.resize(weight, grey.shape[::-1], interpolation=cv2.INTER_LINEAR)
     return float((weights * laplacian**2).sum() / weights.sum())

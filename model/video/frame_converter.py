@@ -1,4 +1,4 @@
-"""FrameConverter: from what a decoder gives to an upright, square-pixel, 8-bit sRGB picture."""
+"""FrameConverter: from what a decoder gives to an upright, square-pixel, 8-bit sRGB image."""
 
 from collections.abc import Mapping
 from fractions import Fraction
@@ -41,8 +41,8 @@ class FrameConverter:
         self._reformatter = VideoReformatter()
         self._matrix: Int[np.ndarray, "3 3"] | None = None
 
-    def picture(self, frame: DecodedFrame, index: int, time_s: float) -> VideoFrame:
-        """The picture, scaled down in the same step, and what was done to it."""
+    def converted(self, frame: DecodedFrame, index: int, time_s: float) -> VideoFrame:
+        """The image, scaled down in the same step, and what was done to it."""
         changes: list[str] = []
         width, height = max(1, round(frame.width * self._pixel_ratio)), frame.height
         if self._pixel_ratio != 1:

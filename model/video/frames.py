@@ -1,4 +1,4 @@
-"""VideoFrames: the pictures that a reconstruction starts from, upright sRGB, and what was done to them."""
+"""VideoFrames: the images that a reconstruction starts from, upright sRGB, and what was done to them."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ class ReadLimits:
     """What may be held in memory at once: about max_frames * max_side_px^2 * 3 bytes."""
 
     max_frames: int  # candidates, spread evenly over the source; not for frames asked for by index
-    max_side_px: int  # larger pictures are scaled down while they are decoded
+    max_side_px: int  # larger images are scaled down while they are decoded
 
     def __post_init__(self) -> None:
         for name in ("max_frames", "max_side_px"):
@@ -43,7 +43,7 @@ class ReadLimits:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VideoFrame:
-    """One picture, upright, with square pixels."""
+    """One image, upright, with square pixels."""
 
     image: UInt8[np.ndarray, "height width 3"]  # sRGB
     index: int  # place in the source, from 0
@@ -60,10 +60,10 @@ class VideoFrame:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VideoFrames:
-    """Frames of one source in its order. Pictures of a folder may differ in size."""
+    """Frames of one source in its order. Images of a folder may differ in size."""
 
     source: str
-    kind: Literal["video", "pictures", "clip"]
+    kind: Literal["video", "images", "clip"]
     frames: tuple[VideoFrame, ...]
     n_source_frames: int
     notes: tuple[str, ...]  # what the user should know: files left out, one frame only, ...
@@ -71,7 +71,7 @@ class VideoFrames:
     def __post_init__(self) -> None:
         if not self.frames:
             raise ModelError(
-                self.source, "no frame", expected="at least one picture", action="Choose another input."
+                self.source, "no frame", expected="at least one image", action="Choose another input."
             )
 
     def __len__(self) -> int:
@@ -136,6 +136,6 @@ def scaled_down(
 
 
 def over_black(rgba: UInt8[np.ndarray, "height width 4"]) -> UInt8[np.ndarray, "height width 3"]:
-    """Transparent pixels become black: in training black is what lies outside the picture."""
+    """Transparent pixels become black: in training black is what lies outside the image."""
     alpha = rgba[..., 3:].astype(np.uint16)
     return ((rgba[..., :3] * alpha + 127) // 255).astype(np.uint8)

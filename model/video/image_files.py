@@ -1,4 +1,4 @@
-"""Pictures of a folder, or a single one, through Pillow, which refuses cut files."""
+"""Images of a folder, or a single one, through Pillow, which refuses cut files."""
 
 import re
 from collections import Counter
@@ -20,40 +20,40 @@ from model.video.frames import (
     scaled_down,
 )
 
-__all__ = ["PICTURE_SUFFIXES", "natural_key", "read_pictures"]
+__all__ = ["IMAGE_SUFFIXES", "natural_key", "read_images"]
 
-PICTURE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
+IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png", ".webp")
 _EXIF_ORIENTATION = 0x0112
 
 
-def read_pictures(
+def read_images(
     folder: Path, files: Sequence[Path], limits: ReadLimits, indices: Sequence[int] | None
 ) -> VideoFrames:
-    """The pictures `indices` of `files`, or candidates spread over them.
+    """The images `indices` of `files`, or candidates spread over them.
 
-    Files that are no pictures are counted in the notes. Raises ModelError when there is none, when one
+    Files that are no images are counted in the notes. Raises ModelError when there is none, when one
     is damaged, or when a frame asked for does not exist.
     """
-    pictures = sorted((f for f in files if f.suffix.lower() in PICTURE_SUFFIXES), key=natural_key)
-    others = Counter(f.suffix.lower() or "(no suffix)" for f in files if f not in set(pictures))
+    images = sorted((f for f in files if f.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
+    others = Counter(f.suffix.lower() or "(no suffix)" for f in files if f not in set(images))
     listed = ", ".join(f"{count} {suffix}" for suffix, count in sorted(others.items()))
-    if not pictures:
+    if not images:
         raise ModelError(
             folder,
-            f"no pictures in this folder ({listed or 'it is empty'})",
-            expected=f"files ending in {', '.join(PICTURE_SUFFIXES)}",
+            f"no images in this folder ({listed or 'it is empty'})",
+            expected=f"files ending in {', '.join(IMAGE_SUFFIXES)}",
             action="Name a folder of frames, or a video file.",
         )
-    n = len(pictures)
+    n = len(images)
     wanted = even_positions(n, limits.max_frames)
     if indices is not None:
         wanted = checked_indices(indices, n, str(folder))
     return VideoFrames(
         source=str(folder),
-        kind="pictures",
-        frames=tuple(_read(pictures[index], index, limits) for index in wanted),
+        kind="images",
+        frames=tuple(_read(images[index], index, limits) for index in wanted),
         n_source_frames=n,
-        notes=(f"files that are no pictures were not read: {listed}",) if others else (),
+        notes=(f"files that are no images were not read: {listed}",) if others else (),
     )
 
 
@@ -70,13 +70,13 @@ def _read(path: Path, index: int, limits: ReadLimits) -> VideoFrame:
             is_turned = opened.getexif().get(_EXIF_ORIENTATION, 1) != 1
             source_size = _upright_size(opened)
             opened.draft("RGB", (limits.max_side_px, limits.max_side_px))  # JPEG: decodes a smaller one
-            picture = ImageOps.exif_transpose(opened) if is_turned else opened
-            full = _rgb(picture, changes)
+            upright_image = ImageOps.exif_transpose(opened) if is_turned else opened
+            full = _rgb(upright_image, changes)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        kind = "not a picture" if isinstance(error, UnidentifiedImageError) else f"damaged ({error})"
+        kind = "not an image" if isinstance(error, UnidentifiedImageError) else f"damaged ({error})"
         raise ModelError(
             path,
-            f"the picture cannot be read: {kind}",
+            f"the image cannot be read: {kind}",
             expected="an intact JPEG, PNG or WebP file",
             action="Replace it, or take it out of the folder.",
         ) from error
@@ -96,25 +96,25 @@ def _read(path: Path, index: int, limits: ReadLimits) -> VideoFrame:
     )
 
 
-def _upright_size(picture: Image.Image) -> tuple[int, int]:
+def _upright_size(image: Image.Image) -> tuple[int, int]:
     """(width, height) after the turn that the EXIF data ask for; 5 to 8 swap the axes."""
-    width, height = picture.size
-    return (height, width) if picture.getexif().get(_EXIF_ORIENTATION, 1) >= 5 else (width, height)
+    width, height = image.size
+    return (height, width) if image.getexif().get(_EXIF_ORIENTATION, 1) >= 5 else (width, height)
 
 
-def _rgb(picture: Image.Image, changes: list[str]) -> UInt8[np.ndarray, "height width 3"]:
-    if picture.mode.startswith("I"):
+def _rgb(image: Image.Image, changes: list[str]) -> UInt8[np.ndarray, "height width 3"]:
+    if image.mode.startswith("I"):
         # Pillow's own conversion cuts 16-bit values off at 255.
         changes.extend(("reduced to 8 bits", "grey copied to three channels"))
-        grey = (np.asarray(picture).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8)
+        grey = (np.asarray(image).astype(np.int64) >> 8).clip(0, 255).astype(np.uint8)
         return np.repeat(grey[..., None], 3, axis=-1)
-    if picture.has_transparency_data:
-        rgba = np.asarray(picture.convert("RGBA"))
+    if image.has_transparency_data:
+        rgba = np.asarray(image.convert("RGBA"))
         if rgba[..., 3].min() < 255:
             changes.append("transparency laid over black")
         return over_black(rgba)
-    if picture.mode in ("L", "1"):
+    if image.mode in ("L", "1"):
         changes.append("grey copied to three channels")
-    elif picture.mode != "RGB":
-        changes.append(f"converted from {picture.mode} to RGB")
-    return np.array(picture.convert("RGB"))
+    elif image.mode != "RGB":
+        changes.append(f"converted from {image.mode} to RGB")
+    return np.array(image.convert("RGB"))

@@ -1,4 +1,4 @@
-"""read_frames: whatever a user points at, as pictures."""
+"""read_frames: whatever a user points at, as images."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,7 +8,7 @@ from pathlib import Path
 from model.errors import ModelError
 from model.video.frame_choice import FrameChoice, choose_frames
 from model.video.frames import ReadLimits, VideoFrames
-from model.video.image_files import PICTURE_SUFFIXES, read_pictures
+from model.video.image_files import IMAGE_SUFFIXES, read_images
 from model.video.shard_clip import read_clip, shards_at
 from model.video.video_file import read_video
 
@@ -18,7 +18,7 @@ __all__ = ["read_frames", "read_informative_frames"]
 def read_frames(
     source: str | Path, limits: ReadLimits, *, indices: Sequence[int] | None = None
 ) -> VideoFrames:
-    """Candidate frames of a video, a folder of pictures, one picture, or a clip (DATASET#CLIP_ID).
+    """Candidate frames of a video, a folder of images, one image, or a clip (DATASET#CLIP_ID).
 
     At most `limits.max_frames`, spread over the source; or exactly the frames `indices` (from 0), when
     given. Raises ModelError for what cannot be used, ShardError for damaged shards.
@@ -35,7 +35,7 @@ def read_informative_frames(
 ) -> tuple[VideoFrames, FrameChoice]:
     """`count` frames chosen among small candidates, read again at up to `max_side_px`, and what decided.
 
-    So a close crop of a 4K video keeps its pixels, while only `count` large pictures are held.
+    So a close crop of a 4K video keeps its pixels, while only `count` large images are held.
     """
     small = read_frames(source, candidates)
     choice = choose_frames(small, count)
@@ -52,9 +52,9 @@ def _read(source: str, limits: ReadLimits, indices: Sequence[int] | None) -> Vid
     if path.is_dir():
         files = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
         _refuse_dataset(source, files)
-        return read_pictures(path, files, limits, indices)
-    if path.suffix.lower() in PICTURE_SUFFIXES and path.is_file():
-        return read_pictures(path, [path], limits, indices)
+        return read_images(path, files, limits, indices)
+    if path.suffix.lower() in IMAGE_SUFFIXES and path.is_file():
+        return read_images(path, [path], limits, indices)
     if path.is_file():
         return read_video(path, limits, indices)
     address, mark, clip_id = source.rpartition("#")
@@ -65,7 +65,7 @@ def _read(source: str, limits: ReadLimits, indices: Sequence[int] | None) -> Vid
     raise ModelError(
         source,
         "no such file or folder",
-        expected="a video, a folder of pictures, or DATASET#CLIP_ID",
+        expected="a video, a folder of images, or DATASET#CLIP_ID",
         action=f"Did you mean '{path.parent / close[0]}'?" if close else "Check the path.",
     )
 

@@ -1,4 +1,4 @@
-"""Frames of a clip of a dataset: the same pictures that a video of it would show, and nothing else."""
+"""Frames of a clip of a dataset: the same images that a video of it would show, and nothing else."""
 
 from collections.abc import Sequence
 from difflib import get_close_matches
@@ -34,7 +34,7 @@ def read_clip(address: str, clip_id: str, limits: ReadLimits, indices: Sequence[
     wanted = even_positions(n, limits.max_frames)
     if indices is not None:
         wanted = checked_indices(indices, n, source)
-    pictures = []
+    images = []
     for index in wanted:
         full = frames.rgb(index)
         image = scaled_down(full, limits.max_side_px)
@@ -42,7 +42,7 @@ def read_clip(address: str, clip_id: str, limits: ReadLimits, indices: Sequence[
         if image.shape != full.shape:
             small = f"{image.shape[1]} x {image.shape[0]}"
             changes.append(f"scaled down from {full.shape[1]} x {full.shape[0]} to {small}")
-        pictures.append(
+        images.append(
             VideoFrame(
                 image=image,
                 index=index,
@@ -52,7 +52,7 @@ def read_clip(address: str, clip_id: str, limits: ReadLimits, indices: Sequence[
                 changes=tuple(changes),
             )
         )
-    return VideoFrames(source=source, kind="clip", frames=tuple(pictures), n_source_frames=n, notes=())
+    return VideoFrames(source=source, kind="clip", frames=tuple(images), n_source_frames=n, notes=())
 
 
 def annotated_boxes(address: str, clip_id: str, frames: VideoFrames) -> Float[np.ndarray, "frame 4"]:

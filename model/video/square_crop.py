@@ -1,6 +1,6 @@
 """The square that the network sees of a frame, and the way back onto the frame.
 
-A square may reach beyond the picture; there it is black, as in training. Pixels follow the project's
+A square may reach beyond the image; there it is black, as in training. Pixels follow the project's
 convention: the corner of the image is (0, 0), the centre of its first pixel (0.5, 0.5).
 """
 
@@ -127,7 +127,7 @@ def parsed_box(text: str, frame: VideoFrame) -> Float[np.ndarray, "4"]:
     elif not (box[0] < box[2] and box[1] < box[3]):
         problem = "no area"
     elif box[0] >= width or box[1] >= height or box[2] <= 0 or box[3] <= 0:
-        problem = "outside of the picture"
+        problem = "outside of the image"
     else:
         return box * np.tile(np.divide(frame.image_size, frame.source_size), 2)
     raise ModelError(

@@ -104,7 +104,7 @@ def _unreadable(path: Path, reason: str) -> ModelError:
 
 
 def _video_streams(container: InputContainer) -> list[VideoStream]:
-    """Without cover pictures of audio files."""
+    """Without cover images of audio files."""
     attached = av.stream.Disposition.attached_pic
     return [stream for stream in container.streams.video if not stream.disposition & attached]
 
@@ -186,10 +186,10 @@ def _decoded(
                 converter = FrameConverter(limits.max_side_px, stream.sample_aspect_ratio or Fraction(1))
                 for position, frame in _walk(container, stream, packets, missing, seeking=seeking):
                     try:
-                        picture = converter.picture(frame, position, _time_s(packets, stream, position))
+                        image = converter.converted(frame, position, _time_s(packets, stream, position))
                     except (av.FFmpegError, OSError) as error:
                         raise _inconvertible(path, position, frame, error) from error
-                    found[position] = picture
+                    found[position] = image
     return found
 
 

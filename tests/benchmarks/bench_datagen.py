@@ -96,7 +96,7 @@ def test_annotation_per_512_frame(tmp_path, say):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_resident_memory_over_500_frames(tmp_path, say):
-    """Resident memory of the render child after each picture, read from outside."""
+    """Resident memory of the render child after each image, read from outside."""
     path = one_motion_config(tmp_path, n_cameras=5, image_size=[32, 32], min_object_size=0.01)
     data = yaml.safe_load(path.read_text())
     data["sampling"]["clip"] |= {"n_frames": 100, "fps": [30.0]}
@@ -117,7 +117,7 @@ def test_resident_memory_over_500_frames(tmp_path, say):
                 pages = int(Path(f"/proc/{child.pid}/statm").read_text().split()[1])
                 rss_mb.append(pages * resource.getpagesize() / 1e6)
     assert child.returncode == 0
-    settled = np.array(rss_mb[20:])  # Cycles allocates its pools during the first pictures
+    settled = np.array(rss_mb[20:])  # Cycles allocates its pools during the first images
     growth = float(np.median(settled[-50:]) - np.median(settled[:50]))
     say(
         f"render child: {len(rss_mb)} frames, resident {settled[0]:.0f} MB, growth {growth:+.1f} MB (claim: < 5 MB)"

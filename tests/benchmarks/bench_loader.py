@@ -52,7 +52,7 @@ class Stored:
 
 
 def photographic(frame: FrameRow) -> FrameRow:
-    """The frame with a picture that is as hard to compress as a rendered one (about 85 kB of PNG)."""
+    """The frame with an image that is as hard to compress as a rendered one (about 85 kB of PNG)."""
     seed = [frame.frame_index, *frame.clip_id.encode()]
     rng = np.random.default_rng(seed)
     smooth = cv2.resize(rng.uniform(0, 255, (24, 24, 3)), (SIZE_PX, SIZE_PX), interpolation=cv2.INTER_CUBIC)

@@ -183,7 +183,7 @@ def test_time_of_a_block(name, say):
 
 
 def test_share_of_time_spent_waiting_for_data(tmp_path, say):
-    """tiny.yaml as it is, on pictures that are as hard to decode as rendered ones."""
+    """tiny.yaml as it is, on images that are as hard to decode as rendered ones."""
     from tests.benchmarks.bench_loader import SIZE_PX, photographic
     from tests.model.data.balls import write_balls
 

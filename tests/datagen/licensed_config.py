@@ -63,9 +63,9 @@ def write_grasped_motion(folder: Path, model: HandModel, uid: str, grasp: GraspC
         cache_dir=folder / "cache",
     )
     asset = library.load(f"objaverse/{uid}@large")
-    hull = trimesh.Trimesh(asset.solid.verts_obj, asset.solid.faces).convex_hull
+    hull = trimesh.Trimesh(asset.watertight.verts_obj, asset.watertight.faces).convex_hull
     part = ConvexPart(verts_obj=np.asarray(hull.vertices), faces=np.asarray(hull.faces))
-    simulated = replace(asset, solid=replace(asset.solid, parts=(part,)))
+    simulated = replace(asset, watertight=replace(asset.watertight, parts=(part,)))
     hand = shape_hand(model, np.zeros(model.shapedirs.shape[2]))
     sequence = synthesise_grasp(hand, simulated, grasp, np.random.default_rng(0)).sequence
     assert sequence is not None

@@ -19,7 +19,7 @@ def command(error: Exception | None, *, result: int) -> int:
 
 
 @pytest.mark.parametrize(
-    ("error", "status"), [(ImageError("no picture", where="x"), 2), (StoppedError("no picture"), 143)]
+    ("error", "status"), [(ImageError("no image", where="x"), 2), (StoppedError("no image"), 143)]
 )
 def test_known_errors_end_with_a_line_and_their_status(capsys, error, status):
     with pytest.raises(SystemExit) as ended:

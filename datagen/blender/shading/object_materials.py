@@ -14,7 +14,7 @@ _UNBENT = 0.85  # of the light; the rest stays as the faint shadow that glass ha
 
 
 def object_material(material: Material) -> bpy.types.Material:
-    """One object material. Alpha is not drawn: masks and pictures must show the same outline.
+    """One object material. Alpha is not drawn: masks and images must show the same outline.
 
     Raises TextureError when an image is damaged.
     """

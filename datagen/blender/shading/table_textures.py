@@ -1,4 +1,4 @@
-"""Pictures of table tops, drawn once per motion: sampling them costs Cycles a third of the same
+"""Images of table tops, drawn once per motion: sampling them costs Cycles a third of the same
 pattern as shader nodes (DECISIONS.md). Knows nothing of Blender; the same seed gives the same piece.
 """
 

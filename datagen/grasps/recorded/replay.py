@@ -32,7 +32,7 @@ _NAN = float("nan")
 
 
 class ReplayError(ValueError):
-    """A recorded motion is not worth drawing; the message says why, with figures."""
+    """A recorded motion is not worth drawing; the message says why, with metrics."""
 
 
 @dataclass(frozen=True, kw_only=True)

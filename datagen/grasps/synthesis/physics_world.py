@@ -77,7 +77,7 @@ class GraspWorld:
         _add_targets(spec)
         self.body, self.model = body, spec.compile()
         self.data = mujoco.MjData(self.model)
-        self.object_verts_obj = np.concatenate([part.verts_obj for part in obj.solid.parts])
+        self.object_verts_obj = np.concatenate([part.verts_obj for part in obj.watertight.parts])
         self._index()
         self._separate_self_contacts()
 
@@ -326,10 +326,12 @@ def _self_contact_bones() -> list[tuple[int, int]]:
 def _add_object(
     spec: mujoco.MjSpec, obj: ObjectAsset, config: GraspConfig
 ) -> tuple[float, Float[np.ndarray, "3"]]:
-    hulls = [trimesh.convex.convex_hull(part.verts_obj) for part in obj.solid.parts]
+    hulls = [trimesh.convex.convex_hull(part.verts_obj) for part in obj.watertight.parts]
     hulls = [hull for hull in hulls if hull.volume > 1e-10]
     if not hulls:
-        raise ValueError(f"{obj.uid}: the solid has no convex part with a volume; decompose it again")
+        raise ValueError(
+            f"{obj.uid}: the watertight mesh has no convex part with a volume; decompose it again"
+        )
     volume = np.array([hull.volume for hull in hulls])
     mass = float(np.clip(config.density_kg_m3 * volume.sum(), *config.mass_kg))
     node = spec.worldbody.add_body(name="object")

@@ -15,7 +15,7 @@ from datagen.grasps.synthesis.preshapes import PreshapeLibrary, closing_rates
 from datagen.grasps.synthesis.start_poses import Start
 from datagen.objects.asset.object_asset import ObjectAsset
 
-__all__ = ["Proposal", "SurfaceSamples", "closing_step", "propose", "sample_surface"]
+__all__ = ["ContactPoints", "Proposal", "closing_step", "propose", "sample_surface"]
 
 SURFACE_POINTS = 2500
 MAX_THICKNESS_M = 0.105
@@ -31,7 +31,7 @@ FOLLOW_RAD = np.deg2rad(18.0)  # a free finger closes this much further than the
 
 
 @dataclass(frozen=True, kw_only=True)
-class SurfaceSamples:
+class ContactPoints:
     """Points on the outside of the object's convex parts."""
 
     points_obj: Float[np.ndarray, "point 3"]
@@ -49,9 +49,9 @@ class Proposal:
     score: float
 
 
-def sample_surface(obj: ObjectAsset, rng: np.random.Generator) -> SurfaceSamples:
+def sample_surface(obj: ObjectAsset, rng: np.random.Generator) -> ContactPoints:
     """Area-weighted samples; points inside another part are left out."""
-    parts = [trimesh.convex.convex_hull(part.verts_obj) for part in obj.solid.parts]
+    parts = [trimesh.convex.convex_hull(part.verts_obj) for part in obj.watertight.parts]
     triangles = np.concatenate([part.triangles for part in parts])
     face_normals = np.concatenate([part.face_normals for part in parts])
     area = np.concatenate([part.area_faces for part in parts])
@@ -64,12 +64,12 @@ def sample_surface(obj: ObjectAsset, rng: np.random.Generator) -> SurfaceSamples
         offset = (part.face_normals * part.triangles[:, 0]).sum(1)
         depth = (points @ part.face_normals.T - offset).max(1)
         outside &= depth > -0.001
-    return SurfaceSamples(points_obj=points[outside], normals_obj=normals[outside])
+    return ContactPoints(points_obj=points[outside], normals_obj=normals[outside])
 
 
 def propose(
     world: GraspWorld,
-    samples: SurfaceSamples,
+    samples: ContactPoints,
     library: PreshapeLibrary,
     start: Start,
     config: GraspConfig,

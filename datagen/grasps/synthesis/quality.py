@@ -1,4 +1,4 @@
-"""Figures of a simulated motion, measured on the skinned hand and the object's own mesh."""
+"""Metrics of a simulated motion, measured on the skinned hand and the object's own mesh."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int

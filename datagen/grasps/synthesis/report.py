@@ -14,7 +14,7 @@ __all__ = ["GraspReport", "GraspReportRow", "summarise"]
 
 @dataclass(frozen=True, kw_only=True)
 class GraspReportRow:
-    """Figures of one object, or of all. Medians over kept motions, NaN when there are none."""
+    """Metrics of one object, or of all. Medians over kept motions, NaN when there are none."""
 
     object_uid: str
     motions: int  # syntheses asked for

@@ -45,7 +45,7 @@ class Start:
 
 def resting_poses(obj: ObjectAsset, com_obj: Float[np.ndarray, "3"]) -> RestingPoses:
     """Stable orientations of the convex hull; the modelled one alone when there is none (a ball)."""
-    verts = np.concatenate([part.verts_obj for part in obj.solid.parts])
+    verts = np.concatenate([part.verts_obj for part in obj.watertight.parts])
     hull = trimesh.convex.convex_hull(verts)
     verts = np.asarray(hull.vertices, float)
     order = np.argsort(-hull.area_faces, kind="stable")

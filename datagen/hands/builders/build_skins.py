@@ -29,7 +29,7 @@ from datagen.hands.builders.texel_map import map_texels
 from datagen.hands.model import HandModel, load_open_hand
 
 SIZE, MARGIN_PX = 1024, 14
-# The hand's corner of MakeHuman's body texture: left, bottom, side, as fractions of the picture.
+# The hand's corner of MakeHuman's body texture: left, bottom, side, as fractions of the image.
 HAND_BOX = (0.361408, 0.011539, 0.192729)
 N_RESIDUAL_AXES = 5
 DETAIL_GAIN = 1.3
@@ -63,7 +63,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     layout = _layout(load_open_hand())
-    contrast = _contrast(_detail_picture(options.rig), layout)
+    contrast = _contrast(_detail_image(options.rig), layout)
     skins: dict[str, Float[np.ndarray, "row column 3"]] = {}
     for path in sorted(options.skins.glob("*/textures/*.png")):
         if "special_suit" not in path.name:
@@ -108,18 +108,18 @@ def _srgb(linear: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
     return np.where(linear <= 0.0031308, linear * 12.92, curve)
 
 
-def _hand_crop(picture: Image.Image) -> Float[np.ndarray, "row column 3"]:
+def _hand_crop(image: Image.Image) -> Float[np.ndarray, "row column 3"]:
     """Linear colour of the hand's corner, SIZE x SIZE."""
-    left, bottom, side = (value * picture.size[0] for value in HAND_BOX)
-    top = picture.size[1] - (bottom + side)
+    left, bottom, side = (value * image.size[0] for value in HAND_BOX)
+    top = image.size[1] - (bottom + side)
     extent = (left, top, left + side, top + side)
-    rgb = picture.convert("RGB")
+    rgb = image.convert("RGB")
     crop = rgb.transform((SIZE, SIZE), Image.Transform.EXTENT, extent, Image.Resampling.BICUBIC)
     return _linear(np.asarray(crop, np.float64) / 255.0)
 
 
-def _detail_picture(rig: Path) -> Image.Image:
-    """The last picture packed into the .blend file: the 2048-pixel skin. Reads no other part of it."""
+def _detail_image(rig: Path) -> Image.Image:
+    """The last image packed into the .blend file: the 2048-pixel skin. Reads no other part of it."""
     raw = rig.read_bytes()
     if raw[:2] == b"\x1f\x8b":
         raw = gzip.decompress(raw)
@@ -131,22 +131,22 @@ def _detail_picture(rig: Path) -> Image.Image:
 
 
 def _blur(
-    picture: Float[np.ndarray, "row column *channel"], sigma: float
+    image: Float[np.ndarray, "row column *channel"], sigma: float
 ) -> Float[np.ndarray, "row column *channel"]:
-    return ndimage.gaussian_filter(picture, (sigma, sigma, 0)[: picture.ndim])
+    return ndimage.gaussian_filter(image, (sigma, sigma, 0)[: image.ndim])
 
 
 def _filled(
-    picture: Float[np.ndarray, "row column *channel"], known: Bool[np.ndarray, "row column"]
+    image: Float[np.ndarray, "row column *channel"], known: Bool[np.ndarray, "row column"]
 ) -> Float[np.ndarray, "row column *channel"]:
     """Unknown texels take the nearest known one, so nothing foreign bleeds over the border."""
     row, column = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return picture[row, column]
+    return image[row, column]
 
 
-def _contrast(picture: Image.Image, layout: Layout) -> Float[np.ndarray, "row column"]:
+def _contrast(image: Image.Image, layout: Layout) -> Float[np.ndarray, "row column"]:
     """Local contrast of the sharp skin; 1 where it has no detail, and beyond its good texels."""
-    sharp = _filled(_hand_crop(picture), layout.good)
+    sharp = _filled(_hand_crop(image), layout.good)
     contrast = (sharp / np.maximum(_blur(sharp, 9.0), 1e-3)).mean(axis=-1)
     fade = np.clip(ndimage.distance_transform_edt(layout.good) / 4.0, 0.0, 1.0)
     return 1.0 + fade * (contrast - 1.0)
@@ -222,12 +222,12 @@ def _write_model(out: Path, skins: dict[str, Float[np.ndarray, "row column 3"]],
     mean, basis, meaning = _fit(list(skins), values)
     anchors = np.linalg.lstsq(basis, (values - mean).T, rcond=None)[0].T
     error = np.abs(mean + anchors @ basis.T - values).mean(axis=1)
-    _save_picture(mean, mask, out / "mean.jpg", SIZE, 93)
+    _save_image(mean, mask, out / "mean.jpg", SIZE, 93)
     axes = []
     for k, text in enumerate(meaning):
         low, high = float(basis[:, k].min()), float(basis[:, k].max())
         step = (high - low) / 255.0
-        _save_picture((basis[:, k] - low) / step, mask, out / f"axis_{k}.jpg", SIZE // 2, 88)
+        _save_image((basis[:, k] - low) / step, mask, out / f"axis_{k}.jpg", SIZE // 2, 88)
         axes.append({"meaning": text, "file": f"axis_{k}.jpg", "low": round(low, 6), "step": round(step, 8)})
     Image.fromarray(np.uint8(255) * layout.footprint).convert("1").save(out / "footprint.png", optimize=True)
     table = {
@@ -250,7 +250,7 @@ def _rounded(row: Float[np.ndarray, " number"], digits: int) -> list[float]:
     return [round(float(number), digits) for number in row]
 
 
-def _save_picture(
+def _save_image(
     values: Float[np.ndarray, " value"],
     mask: Bool[np.ndarray, "3 column row"],
     path: Path,
@@ -260,9 +260,9 @@ def _save_picture(
     """JPEG of one vector; texels outside continue the border so that compression does not bleed inward."""
     flat = np.zeros(mask.shape)
     flat[mask] = np.clip(values, 0.0, 255.0)
-    picture = _filled(flat.transpose(2, 1, 0), mask[0].T)
-    image = Image.fromarray(np.uint8(np.rint(picture))).resize((size, size), Image.Resampling.BOX)
-    image.save(path, quality=quality, subsampling=0, optimize=True)
+    image = _filled(flat.transpose(2, 1, 0), mask[0].T)
+    encoded = Image.fromarray(np.uint8(np.rint(image))).resize((size, size), Image.Resampling.BOX)
+    encoded.save(path, quality=quality, subsampling=0, optimize=True)
 
 
 def _write_gray(path: Path, values: Float[np.ndarray, "row column"]) -> None:

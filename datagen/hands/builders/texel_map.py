@@ -10,7 +10,7 @@ __all__ = ["TexelMap", "map_texels"]
 
 @dataclass(frozen=True, kw_only=True)
 class TexelMap:
-    """Row 0 is the top of the picture; face -1 where the layout is empty."""
+    """Row 0 is the top of the image; face -1 where the layout is empty."""
 
     face: Int[np.ndarray, "row column"]
     barycentric: Float[np.ndarray, "row column 3"]

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, Solid
+from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, WatertightMesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 
 __all__ = ["is_mirrored", "mirrored_asset", "mirrored_uid", "unmirrored_uid"]
@@ -32,7 +32,7 @@ def mirrored_asset(asset: ObjectAsset) -> ObjectAsset:
         asset,
         uid=uid,
         mesh=_mirrored_mesh(asset.mesh),
-        solid=_mirrored_solid(asset.solid),
+        watertight=_mirrored_watertight(asset.watertight),
         T_obj_from_file=T_mirror @ asset.T_obj_from_file,
         registration=registration,
     )
@@ -67,15 +67,15 @@ def _mirrored_mesh(mesh: ObjectMesh) -> ObjectMesh:
     )
 
 
-def _mirrored_solid(solid: Solid) -> Solid:
+def _mirrored_watertight(watertight: WatertightMesh) -> WatertightMesh:
     return replace(
-        solid,
-        verts_obj=_mirrored_points(solid.verts_obj),
-        faces=np.ascontiguousarray(solid.faces[:, ::-1]),
+        watertight,
+        verts_obj=_mirrored_points(watertight.verts_obj),
+        faces=np.ascontiguousarray(watertight.faces[:, ::-1]),
         parts=tuple(
             ConvexPart(
                 verts_obj=_mirrored_points(part.verts_obj), faces=np.ascontiguousarray(part.faces[:, ::-1])
             )
-            for part in solid.parts
+            for part in watertight.parts
         ),
     )

@@ -10,7 +10,7 @@ from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.registration import Registration
 from datagen.objects.mesh.texture_quality import TextureQuality
 
-__all__ = ["ConvexPart", "ObjectAsset", "Solid", "SolidFit"]
+__all__ = ["ConvexPart", "ObjectAsset", "WatertightFit", "WatertightMesh"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,21 +22,21 @@ class ConvexPart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolidFit:
-    """How far the solid is from the drawn mesh, and the hulls from the solid. Metres."""
+class WatertightFit:
+    """How far the watertight mesh is from the drawn mesh, and the hulls from the watertight mesh. Metres."""
 
     deviation_mean_m: float  # solid surface to the nearest point of the drawn mesh
     deviation_p99_m: float
     deviation_max_m: float
-    uncovered_max_m: float  # outer points of the drawn mesh to the solid surface
-    # NaN for a solid without convex parts:
-    hull_excess_p99_m: float  # hull surface that lies outside the solid
+    uncovered_max_m: float  # outer points of the drawn mesh to the watertight mesh surface
+    # NaN for a watertight mesh without convex parts:
+    hull_excess_p99_m: float  # hull surface that lies outside the watertight mesh
     hull_excess_max_m: float
     hull_uncovered_max_m: float  # depth of solid surface points that no hull contains
 
 
 @dataclass(frozen=True, kw_only=True)
-class Solid:
+class WatertightMesh:
     """A closed version of the drawn mesh, in the same object frame. Metres.
 
     Single sheets (a paper cup) have got a thickness; cavities that nothing can reach are filled.
@@ -46,7 +46,7 @@ class Solid:
     faces: Int[np.ndarray, "face 3"]
     parts: tuple[ConvexPart, ...]  # empty where no physics will run (recorded motions)
     watertight_source: bool  # the drawn mesh was closed; its own surface is kept
-    fit: SolidFit | None = None  # None: made by hand, not measured
+    fit: WatertightFit | None = None  # None: made by hand, not measured
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +60,7 @@ class ObjectAsset:
     author: str
     url: str
     mesh: ObjectMesh
-    solid: Solid
+    watertight: WatertightMesh
     catalogue_scale: float  # size here / size in the source (below 1: a miniature)
     texture: TextureQuality
     # Axes, unit and centring in one similarity: x_obj = T_obj_from_file @ x_file.

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from datagen.objects.asset.object_asset import Solid
+from datagen.objects.asset.object_asset import WatertightMesh
 from datagen.objects.builders.starter_selection import DROPPED, SELECTION, Look, Pick
 from datagen.objects.formats.glb_export import mesh_to_glb
 from datagen.objects.formats.reading import object_mesh
@@ -33,7 +33,11 @@ from datagen.objects.mesh.submeshes import mesh_pieces, sub_mesh
 from datagen.objects.mesh.texture_quality import measure_texture_quality
 from datagen.objects.stores.library import REFERENCE_READING
 from datagen.objects.stores.sweethome3d import CatalogueEntry, find_libraries, read_catalogue, read_model
-from datagen.objects.watertight.preparation import REFERENCE_PREPARATION, cached_solid, solid_to_bytes
+from datagen.objects.watertight.preparation import (
+    REFERENCE_PREPARATION,
+    cached_watertight,
+    watertight_to_bytes,
+)
 
 LIBRARY = "BlendSwap-CC-0"
 SOURCE = f"sweethome3d-furniture 1.8-1, {LIBRARY}.sh3f"
@@ -49,7 +53,7 @@ class Built:
 
     slug: str
     glb: bytes
-    solid: Solid
+    watertight: WatertightMesh
     entry: dict[str, Any]
 
 
@@ -58,7 +62,7 @@ def main() -> None:
     parser.add_argument("package", type=Path, nargs="?", help=".deb or unpacked folder; default: installed")
     parser.add_argument("--out", type=Path, default=Path(__file__).parents[1] / "data")
     parser.add_argument("--cache", type=Path, default=Path("~/.cache/forehoi/objects"))
-    parser.add_argument("--only", nargs="*", help="build these slugs and print figures; write no pack")
+    parser.add_argument("--only", nargs="*", help="build these slugs and print metrics; write no pack")
     arguments = parser.parse_args()
     with TemporaryDirectory() as folder:
         root = arguments.package
@@ -72,7 +76,7 @@ def main() -> None:
             if arguments.only and pick.slug not in arguments.only:
                 continue
             built.append(build(pick, library, catalogue[pick.model], arguments.cache.expanduser()))
-            print_figures(built[-1])
+            print_metrics(built[-1])
     if not arguments.only:
         arguments.out.mkdir(parents=True, exist_ok=True)
         write_pack(built, arguments.out / "starter_pack.zip")
@@ -115,11 +119,11 @@ def build(pick: Pick, library: Path, entry: CatalogueEntry, cache_dir: Path) -> 
     # Everything derived comes from the mesh as users will load it.
     file_mesh = read_gltf(Path(pick.slug), glb)
     mesh = object_mesh(file_mesh, Path(pick.slug), REFERENCE_READING, unit="m", up_axis="y").mesh
-    solid = cached_solid(mesh, REFERENCE_PREPARATION, cache_dir, source=pick.slug)
+    watertight = cached_watertight(mesh, REFERENCE_PREPARATION, cache_dir, source=pick.slug)
     return Built(
         slug=pick.slug,
         glb=glb,
-        solid=solid,
+        watertight=watertight,
         entry={
             "uid": f"starter/{pick.slug}",
             "name": pick.name,
@@ -167,7 +171,7 @@ def write_pack(built: list[Built], path: Path) -> None:
         archive.writestr(zipfile.ZipInfo("index.json"), index, zipfile.ZIP_DEFLATED, 9)
         for item in built:
             archive.writestr(zipfile.ZipInfo(f"{item.slug}.glb"), item.glb, zipfile.ZIP_DEFLATED, 9)
-            data = solid_to_bytes(item.solid)
+            data = watertight_to_bytes(item.watertight)
             archive.writestr(zipfile.ZipInfo(f"{item.slug}.npz"), data, zipfile.ZIP_STORED)
 
 
@@ -200,13 +204,13 @@ def attribution(built: list[Built]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def print_figures(item: Built) -> None:
-    fit, size = item.solid.fit, [round(100 * side, 1) for side in item.entry["size_m"]]
+def print_metrics(item: Built) -> None:
+    fit, size = item.watertight.fit, [round(100 * side, 1) for side in item.entry["size_m"]]
     assert fit is not None
     print(
         f"{item.slug:16s} {size} cm x{item.entry['catalogue_scale']:.2f} glb {len(item.glb) // 1000} kB, solid "
-        f"{len(item.solid.faces)} faces{'' if item.solid.watertight_source else ' (level set)'}, "
-        f"{len(item.solid.parts)} hulls | mm: deviation {1e3 * fit.deviation_mean_m:.2f} mean "
+        f"{len(item.watertight.faces)} faces{'' if item.watertight.watertight_source else ' (level set)'}, "
+        f"{len(item.watertight.parts)} hulls | mm: deviation {1e3 * fit.deviation_mean_m:.2f} mean "
         f"{1e3 * fit.deviation_max_m:.2f} max, uncovered {1e3 * fit.uncovered_max_m:.2f}, hull excess "
         f"{1e3 * fit.hull_excess_p99_m:.2f} p99 {1e3 * fit.hull_excess_max_m:.2f} max, hull short "
         f"{1e3 * fit.hull_uncovered_max_m:.2f}",

@@ -13,7 +13,7 @@ from datagen.objects.mesh.surface_points import sample_surface
 __all__ = ["TextureQuality", "measure_texture_quality"]
 
 N_POINTS = 4096
-NEIGHBOUR_M = 0.002  # two points this far apart are told apart in a 512 px picture of the object
+NEIGHBOUR_M = 0.002  # two points this far apart are told apart in a 512 px image of the object
 FULL_DETAIL = 0.10  # mean absolute difference of neighbours that counts as 1
 
 

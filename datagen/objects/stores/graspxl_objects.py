@@ -25,7 +25,7 @@ from datagen.objects.mesh.plain_look import with_plain_look
 from datagen.objects.mesh.registration import Registration, RegistrationConfig, register
 from datagen.objects.mesh.texture_quality import TextureQuality, measure_texture_quality
 from datagen.objects.stores.objaverse import ObjaverseAnnotation, ObjaverseStore
-from datagen.objects.watertight.preparation import PreparationConfig, cached_solid
+from datagen.objects.watertight.preparation import PreparationConfig, cached_watertight
 
 __all__ = ["SIZES", "GraspXLObjects", "GraspXLTextures"]
 
@@ -57,7 +57,7 @@ class _Drawn:
 class GraspXLObjects:
     """The meshes of `object_dataset`; uid "objaverse/<Objaverse uid>@<small, medium or large>".
 
-    `T_obj_from_file` is a shift: it leads from the frame of the recorded poses to ours. Solids have
+    `T_obj_from_file` is a shift: it leads from the frame of the recorded poses to ours. Watertight meshes have
     no convex parts, as recorded motions need no physics.
 
     `textures`: "none" draws a generated look; "when_present" draws the textured model where the
@@ -118,7 +118,7 @@ class GraspXLObjects:
         return self._uids
 
     def load(self, uid: str) -> ObjectAsset:
-        """Read, repair and prepare one mesh; solids come from the cache the second time."""
+        """Read, repair and prepare one mesh; watertight meshes come from the cache the second time."""
         file = self._file(uid)
         read = read_object(file, self._reading)
         drawn = self._drawn(read, file)
@@ -130,7 +130,9 @@ class GraspXLObjects:
             author=drawn.author,
             url=drawn.url,
             mesh=drawn.mesh,
-            solid=cached_solid(drawn.mesh, self._preparation, self._cache_dir, source=file, with_parts=False),
+            watertight=cached_watertight(
+                drawn.mesh, self._preparation, self._cache_dir, source=file, with_parts=False
+            ),
             catalogue_scale=1.0,  # of GraspXL's size; the model's own scale is in `registration`
             texture=measure_texture_quality(drawn.texture_source),
             T_obj_from_file=read.T_obj_from_file,
@@ -148,7 +150,7 @@ class GraspXLObjects:
         return ObjectDescription(licence=_bare_licence(note), annotation=note, appearance="generated")
 
     def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the solid."""
+        """As `load` measures it, without making the watertight mesh."""
         file = self._file(uid)
         drawn = self._drawn(read_object(file, self._reading), file)
         return measure_texture_quality(drawn.texture_source)

@@ -21,7 +21,7 @@ from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.outward_faces import outward_mesh
 from datagen.objects.mesh.texture_quality import TextureQuality, measure_texture_quality
 from datagen.objects.stores.sweethome3d import CatalogueEntry, find_libraries, read_catalogue, read_model
-from datagen.objects.watertight.preparation import PreparationConfig, cached_solid, solid_from_bytes
+from datagen.objects.watertight.preparation import PreparationConfig, cached_watertight, watertight_from_bytes
 
 __all__ = ["REFERENCE_READING", "MeshFolder", "ObjectLibrary", "StarterPack", "Sweethome3D"]
 
@@ -53,7 +53,7 @@ def _unknown(where: object, uid: str) -> ObjectError:
 
 
 class StarterPack:
-    """The CC0 objects that ship with the package, solids and convex parts included."""
+    """The CC0 objects that ship with the package, watertight meshes and convex parts included."""
 
     def __init__(self) -> None:
         data = files("datagen.objects").joinpath("data", "starter_pack.zip").read_bytes()
@@ -80,7 +80,7 @@ class StarterPack:
             author=entry["author"],
             url=entry["url"],
             mesh=read.mesh,
-            solid=solid_from_bytes(self._archive.read(f"{slug}.npz")),
+            watertight=watertight_from_bytes(self._archive.read(f"{slug}.npz")),
             catalogue_scale=entry["catalogue_scale"],
             texture=TextureQuality(**entry["texture"]),
             T_obj_from_file=read.T_obj_from_file,
@@ -135,7 +135,7 @@ class MeshFolder:
         return tuple(self._files)
 
     def load(self, uid: str) -> ObjectAsset:
-        """Read, repair and prepare one mesh; solids come from the cache the second time."""
+        """Read, repair and prepare one mesh; watertight meshes come from the cache the second time."""
         file, note = self._file(uid), self._note(uid)
         read = read_object(file, self._reading)
         mesh = outward_mesh(read.mesh)
@@ -147,7 +147,7 @@ class MeshFolder:
             author=note.get("author") or "unknown",
             url=note.get("url") or "",
             mesh=mesh,
-            solid=cached_solid(mesh, self._preparation, self._cache_dir, source=file),
+            watertight=cached_watertight(mesh, self._preparation, self._cache_dir, source=file),
             catalogue_scale=1.0,
             texture=measure_texture_quality(mesh),
             T_obj_from_file=read.T_obj_from_file,
@@ -159,7 +159,7 @@ class MeshFolder:
         return ObjectDescription(licence=self._note(uid).get("licence") or UNKNOWN_LICENCE)
 
     def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the solid."""
+        """As `load` measures it, without making the watertight mesh."""
         return measure_texture_quality(outward_mesh(read_object(self._file(uid), self._reading).mesh))
 
     def _file(self, uid: str) -> Path:
@@ -231,7 +231,7 @@ class Sweethome3D:
         return tuple(self._entries)
 
     def load(self, uid: str) -> ObjectAsset:
-        """Read, repair and prepare one model; solids come from the cache the second time."""
+        """Read, repair and prepare one model; watertight meshes come from the cache the second time."""
         _, entry = self._entry(uid)
         read, factor, mesh = self._read(uid)
         return ObjectAsset(
@@ -242,7 +242,7 @@ class Sweethome3D:
             author=entry.creator,
             url="https://www.sweethome3d.com/importModels.jsp",
             mesh=mesh,
-            solid=cached_solid(mesh, self._preparation, self._cache_dir, source=uid),
+            watertight=cached_watertight(mesh, self._preparation, self._cache_dir, source=uid),
             catalogue_scale=factor,
             texture=measure_texture_quality(mesh),
             T_obj_from_file=np.diag([factor, factor, factor, 1.0]) @ read.T_obj_from_file,
@@ -253,7 +253,7 @@ class Sweethome3D:
         return ObjectDescription(licence=self._entry(uid)[1].licence)
 
     def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the solid."""
+        """As `load` measures it, without making the watertight mesh."""
         return measure_texture_quality(self._read(uid)[2])
 
     def _entry(self, uid: str) -> tuple[Path, CatalogueEntry]:

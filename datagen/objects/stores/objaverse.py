@@ -29,7 +29,7 @@ from datagen.objects.mesh.graspable_size import fitted_scale, scaled_mesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.outward_faces import outward_mesh
 from datagen.objects.mesh.texture_quality import TextureQuality, measure_texture_quality
-from datagen.objects.watertight.preparation import PreparationConfig, cached_solid
+from datagen.objects.watertight.preparation import PreparationConfig, cached_watertight
 
 __all__ = ["ObjaverseAnnotation", "ObjaverseStore", "objaverse_root"]
 
@@ -107,7 +107,7 @@ class ObjaverseStore:
         )
 
     def load(self, uid: str) -> ObjectAsset:
-        """Read, scale, repair and prepare one model; solids come from the cache the second time."""
+        """Read, scale, repair and prepare one model; watertight meshes come from the cache the second time."""
         path = self.glb_path(uid)
         read, factor, mesh = self._read(path)
         note = self.annotation(uid)
@@ -119,7 +119,7 @@ class ObjaverseStore:
             author=(note and note.author) or "unknown",
             url=(note and note.url) or "",
             mesh=mesh,
-            solid=cached_solid(mesh, self._preparation, self._cache_dir, source=path),
+            watertight=cached_watertight(mesh, self._preparation, self._cache_dir, source=path),
             catalogue_scale=factor,
             texture=measure_texture_quality(mesh),
             T_obj_from_file=np.diag([factor, factor, factor, 1.0]) @ read.T_obj_from_file,
@@ -132,7 +132,7 @@ class ObjaverseStore:
         return ObjectDescription(licence=note.licence if note else UNKNOWN_LICENCE, annotation=note)
 
     def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the solid."""
+        """As `load` measures it, without making the watertight mesh."""
         return measure_texture_quality(self._read(self.glb_path(uid))[2])
 
     def _read(self, path: Path) -> tuple[ReadObject, float, ObjectMesh]:

@@ -1,7 +1,7 @@
 """Learning targets: what the network is taught about an object's shape and colour.
 
 Canonical frame: the mesh's own axes (Z up), bbox centre 0, longest bbox side of the drawn mesh 1.
-All targets describe the *solid*: closed, with no hidden inner geometry.
+All targets describe the *watertight* mesh, with no hidden inner geometry.
 """
 
 import hashlib
@@ -11,7 +11,7 @@ import igl
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
-from datagen.objects.asset.object_asset import ObjectAsset, Solid
+from datagen.objects.asset.object_asset import ObjectAsset, WatertightMesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.surface_points import colors_at, sample_surface
 from datagen.objects.targets.occupancy import surface_voxels
@@ -36,7 +36,7 @@ class TargetsConfig:
 class LearningTargets:
     """Canonical frame and unit throughout; `x_objmesh = T_objmesh_from_canonical @ x_canonical`."""
 
-    # Voxels that the solid's surface passes through, as TRELLIS' sparse structure (not its inside).
+    # Voxels that the watertight mesh's surface passes through, as TRELLIS' sparse structure (not its inside).
     occupancy_64: UInt8[np.ndarray, "voxel 3"]
     surface_points: Float32[np.ndarray, "point 3"]
     surface_normals: Float32[np.ndarray, "point 3"]
@@ -51,14 +51,14 @@ def learning_targets(asset: ObjectAsset, seed: int, config: TargetsConfig) -> Le
     """Occupancy, surface samples and signed distances of one object. Same seed, same bytes."""
     digest = hashlib.sha256(asset.uid.encode()).digest()
     rng = np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
-    both = np.concatenate([asset.mesh.verts_obj, asset.solid.verts_obj])  # sheets are thickened in the solid
+    both = np.concatenate([asset.mesh.verts_obj, asset.watertight.verts_obj])  # sheets are thickened there
     low, high = both.min(axis=0), both.max(axis=0)
     scale_m, center = float((high - low).max()), 0.5 * (low + high)
-    verts = (asset.solid.verts_obj - center) / scale_m
-    faces = asset.solid.faces
-    solid = _as_mesh(asset.solid)
-    surface = sample_surface(solid, config.surface_points, rng)
-    near = sample_surface(solid, config.sdf_near_points, rng)
+    verts = (asset.watertight.verts_obj - center) / scale_m
+    faces = asset.watertight.faces
+    watertight = _as_mesh(asset.watertight)
+    surface = sample_surface(watertight, config.surface_points, rng)
+    near = sample_surface(watertight, config.sdf_near_points, rng)
     offset = config.sdf_near_sigma * rng.standard_normal((config.sdf_near_points, 1))
     sdf_points = np.concatenate(
         [
@@ -80,12 +80,12 @@ def learning_targets(asset: ObjectAsset, seed: int, config: TargetsConfig) -> Le
     )
 
 
-def _as_mesh(solid: Solid) -> ObjectMesh:
+def _as_mesh(watertight: WatertightMesh) -> ObjectMesh:
     return ObjectMesh(
-        verts_obj=solid.verts_obj,
-        faces=solid.faces,
-        corner_uv=np.zeros((len(solid.faces), 3, 2)),
-        face_material=np.zeros(len(solid.faces), dtype=np.int64),
+        verts_obj=watertight.verts_obj,
+        faces=watertight.faces,
+        corner_uv=np.zeros((len(watertight.faces), 3, 2)),
+        face_material=np.zeros(len(watertight.faces), dtype=np.int64),
         materials=(),
     )
 

@@ -1,4 +1,4 @@
-"""Convex parts for the physics: CoACD on a lightened solid, cut finer until the hulls fit."""
+"""Convex parts for the physics: CoACD on a watertight mesh with fewer faces, cut finer until the hulls fit."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,11 @@ from manifold3d import Manifold, Mesh64, OpType
 
 from datagen.objects.asset.object_asset import ConvexPart
 from datagen.objects.mesh.surface_points import face_areas, face_normals
-from datagen.objects.watertight.watertight_mesh import ClosedSurface, decimated_closed, signed_distance
+from datagen.objects.watertight.watertight_mesh import (
+    WatertightSurface,
+    decimated_watertight,
+    signed_distance,
+)
 
 __all__ = ["ConvexConfig", "HullFit", "convex_parts", "hull_fit"]
 
@@ -26,24 +30,26 @@ class ConvexConfig:
     max_hulls: int
     max_hull_verts: int
     hull_tolerance_m: float  # a hull gets no more vertices once it is this close to its full form
-    max_excess_m: float  # hull surface outside the solid (99th percentile) that ends the search
-    max_faces: int  # the solid is lightened to about this many faces first
+    max_excess_m: float  # hull surface outside the watertight mesh (99th percentile) that ends the search
+    max_faces: int  # the watertight mesh is lightened to about this many faces first
     mcts_iterations: int  # CoACD's search effort per cut; its own default is 150
     seed: int
 
 
 @dataclass(frozen=True, kw_only=True)
 class HullFit:
-    """Union of the hulls against the solid, metres."""
+    """Union of the hulls against the watertight mesh, metres."""
 
     excess_p99_m: float
     excess_max_m: float
     uncovered_max_m: float
 
 
-def convex_parts(solid: ClosedSurface, config: ConvexConfig) -> tuple[tuple[ConvexPart, ...], HullFit]:
+def convex_parts(
+    watertight: WatertightSurface, config: ConvexConfig
+) -> tuple[tuple[ConvexPart, ...], HullFit]:
     """The decomposition with the smallest excess, and its fit. Deterministic."""
-    verts, faces = _lightened(solid, config.max_faces)
+    verts, faces = _lightened(watertight, config.max_faces)
     coacd.set_log_level("error")
     best: tuple[tuple[ConvexPart, ...], HullFit] | None = None
     for threshold in config.thresholds:
@@ -51,7 +57,7 @@ def convex_parts(solid: ClosedSurface, config: ConvexConfig) -> tuple[tuple[Conv
             coacd.Mesh(verts, faces),
             threshold=threshold,
             max_convex_hull=config.max_hulls,
-            preprocess_mode="off",  # the solid is a manifold already
+            preprocess_mode="off",  # the watertight mesh is a manifold already
             decimate=False,
             mcts_iterations=config.mcts_iterations,
             mcts_nodes=MCTS_NODES,
@@ -59,7 +65,7 @@ def convex_parts(solid: ClosedSurface, config: ConvexConfig) -> tuple[tuple[Conv
             seed=config.seed,
         )
         parts = tuple(_part(hull_verts, config) for hull_verts, _ in raw)
-        fit = hull_fit(solid, parts)
+        fit = hull_fit(watertight, parts)
         if best is None or fit.excess_p99_m < best[1].excess_p99_m:
             best = parts, fit
         if fit.excess_p99_m <= config.max_excess_m:
@@ -102,10 +108,10 @@ def _manifold(verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3
 
 
 def _lightened(
-    solid: ClosedSurface, max_faces: int
+    watertight: WatertightSurface, max_faces: int
 ) -> tuple[Float[np.ndarray, "vert 3"], Int[np.ndarray, "face 3"]]:
-    """The same solid with fewer faces, still closed; CoACD's time grows with them."""
-    return decimated_closed(solid.verts_obj, solid.faces, max_faces)
+    """The same mesh with fewer faces, still closed; CoACD's time grows with them."""
+    return decimated_watertight(watertight.verts_obj, watertight.faces, max_faces)
 
 
 def _surface_points(
@@ -118,17 +124,17 @@ def _surface_points(
     return np.einsum("pk,pkc->pc", barycentric, corners)
 
 
-def hull_fit(solid: ClosedSurface, parts: tuple[ConvexPart, ...]) -> HullFit:
-    """How far the union of hulls reaches out of the solid, and where it falls short of it."""
+def hull_fit(watertight: WatertightSurface, parts: tuple[ConvexPart, ...]) -> HullFit:
+    """How far the union of hulls reaches out of the watertight mesh, and where it falls short of it."""
     rng = np.random.default_rng(0)
     union = Manifold.batch_boolean([_manifold(p.verts_obj, p.faces) for p in parts], OpType.Add)
     mesh = union.to_mesh64()
     union_verts = np.array(mesh.vert_properties[:, :3], dtype=np.float64)
     union_faces = np.array(mesh.tri_verts, dtype=np.int64)
     on_hulls = np.concatenate([_surface_points(union_verts, union_faces, rng), union_verts])
-    excess = signed_distance(solid.verts_obj, solid.faces, on_hulls)
-    on_solid = _surface_points(solid.verts_obj, solid.faces, rng)
-    short = signed_distance(union_verts, union_faces, on_solid)
+    excess = signed_distance(watertight.verts_obj, watertight.faces, on_hulls)
+    on_watertight = _surface_points(watertight.verts_obj, watertight.faces, rng)
+    short = signed_distance(union_verts, union_faces, on_watertight)
     return HullFit(
         excess_p99_m=float(max(np.percentile(excess[:N_FIT_POINTS], 99), 0.0)),
         excess_max_m=float(max(excess.max(), 0.0)),

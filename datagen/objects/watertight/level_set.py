@@ -162,16 +162,16 @@ def _side_and_wall(
     # A wall is solid if the point half way through it is.
     middle = band.nearest - normals * np.minimum(0.5 * thickness, 2.0 * band.voxel)[:, None]
     is_thin = thickness < 2.0 * band.voxel
-    solid_behind = band.lookup(unreached, middle)
+    watertight_behind = band.lookup(unreached, middle)
     thin_middle = np.ascontiguousarray(middle[is_thin])
-    solid_behind[is_thin] |= igl.fast_winding_number(verts, faces, thin_middle) > 0.5
-    solid_in_front = band.lookup(unreached, band.nearest + 2.0 * band.voxel * normals)
+    watertight_behind[is_thin] |= igl.fast_winding_number(verts, faces, thin_middle) > 0.5
+    watertight_in_front = band.lookup(unreached, band.nearest + 2.0 * band.voxel * normals)
     next_to_surface = band.distance < BARRIER * band.voxel
     inside = unreached[tuple(band.index.T)] & ~next_to_surface
-    unclear = next_to_surface & solid_behind
+    unclear = next_to_surface & watertight_behind
     winding = igl.fast_winding_number(verts, faces, np.ascontiguousarray(band.points[unclear]))
-    inside[unclear] = (winding > 0.5) | solid_in_front[unclear]
-    return np.where(inside, -1.0, 1.0), np.where(solid_behind, thickness, 0.0)
+    inside[unclear] = (winding > 0.5) | watertight_in_front[unclear]
+    return np.where(inside, -1.0, 1.0), np.where(watertight_behind, thickness, 0.0)
 
 
 def _patch_over_holes(

@@ -1,4 +1,4 @@
-"""From a drawn mesh to an ObjectAsset: outward faces, solid, convex parts, figures, cache."""
+"""From a drawn mesh to an ObjectAsset: outward faces, watertight mesh, convex parts, metrics, cache."""
 
 import hashlib
 import io
@@ -11,25 +11,25 @@ import igl
 import numpy as np
 from jaxtyping import Float, Int
 
-from datagen.objects.asset.object_asset import ConvexPart, Solid, SolidFit
+from datagen.objects.asset.object_asset import ConvexPart, WatertightFit, WatertightMesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.surface_points import sample_surface
 from datagen.objects.watertight.convex_parts import ConvexConfig, HullFit, convex_parts
 from datagen.objects.watertight.level_set import LevelSetConfig
 from datagen.objects.watertight.watertight_mesh import (
-    ClosedSurface,
-    SolidConfig,
-    closed_surface,
+    WatertightConfig,
+    WatertightSurface,
     signed_distance,
+    watertight_surface,
 )
 
 __all__ = [
     "REFERENCE_PREPARATION",
     "PreparationConfig",
-    "cached_solid",
-    "make_solid",
-    "solid_from_bytes",
-    "solid_to_bytes",
+    "cached_watertight",
+    "make_watertight",
+    "watertight_from_bytes",
+    "watertight_to_bytes",
 ]
 
 CACHE_VERSION = 1  # raise it when the algorithms change: older cache entries are then ignored
@@ -39,15 +39,15 @@ NO_HULLS = HullFit(excess_p99_m=float("nan"), excess_max_m=float("nan"), uncover
 
 @dataclass(frozen=True, kw_only=True)
 class PreparationConfig:
-    """How solids and convex parts are made."""
+    """How watertight meshes and convex parts are made."""
 
-    solid: SolidConfig
+    watertight: WatertightConfig
     convex: ConvexConfig
 
 
 # What the starter pack was built with; libraries of other meshes use the same.
 REFERENCE_PREPARATION = PreparationConfig(
-    solid=SolidConfig(
+    watertight=WatertightConfig(
         level_set=LevelSetConfig(voxels_longest=192, min_voxel_m=0.0003, max_hole_m=0.004, sheet_voxels=1.8),
         tolerance_m=5e-5,
         max_faces=12000,
@@ -65,16 +65,16 @@ REFERENCE_PREPARATION = PreparationConfig(
 )
 
 
-def make_solid(
+def make_watertight(
     mesh: ObjectMesh, config: PreparationConfig, *, source: object, with_parts: bool = True
-) -> Solid:
-    """Closed surface, convex parts and their measured fit. Takes seconds; see `cached_solid`.
+) -> WatertightMesh:
+    """Closed surface, convex parts and their measured fit. Takes seconds; see `cached_watertight`.
 
     `with_parts=False` leaves out the convex parts, which take most of the time and only physics needs.
     """
-    surface = closed_surface(mesh.verts_obj, mesh.faces, config.solid, source=source)
+    surface = watertight_surface(mesh.verts_obj, mesh.faces, config.watertight, source=source)
     parts, hulls = convex_parts(surface, config.convex) if with_parts else ((), NO_HULLS)
-    return Solid(
+    return WatertightMesh(
         verts_obj=surface.verts_obj,
         faces=surface.faces,
         parts=parts,
@@ -83,12 +83,12 @@ def make_solid(
     )
 
 
-def _fit(mesh: ObjectMesh, surface: ClosedSurface, hulls: HullFit) -> SolidFit:
+def _fit(mesh: ObjectMesh, surface: WatertightSurface, hulls: HullFit) -> WatertightFit:
     rng = np.random.default_rng(0)
     deviation = _distance_to(surface, mesh, rng)
     drawn = sample_surface(mesh, N_DEVIATION_POINTS, rng).points_obj
     outside = signed_distance(surface.verts_obj, surface.faces, drawn)
-    return SolidFit(
+    return WatertightFit(
         deviation_mean_m=float(deviation.mean()),
         deviation_p99_m=float(np.percentile(deviation, 99)),
         deviation_max_m=float(deviation.max()),
@@ -100,9 +100,9 @@ def _fit(mesh: ObjectMesh, surface: ClosedSurface, hulls: HullFit) -> SolidFit:
 
 
 def _distance_to(
-    surface: ClosedSurface, mesh: ObjectMesh, rng: np.random.Generator
+    surface: WatertightSurface, mesh: ObjectMesh, rng: np.random.Generator
 ) -> Float[np.ndarray, " point"]:
-    """Distance of points of the solid's surface to the drawn mesh."""
+    """Distance of points of the watertight mesh's surface to the drawn mesh."""
     as_mesh = ObjectMesh(
         verts_obj=surface.verts_obj,
         faces=surface.faces,
@@ -123,55 +123,57 @@ def _key(
     config: PreparationConfig,
     with_parts: bool,
 ) -> str:
-    parameters = f"{asdict(config)}" if with_parts else f"{asdict(config.solid)} without parts"
+    parameters = f"{asdict(config)}" if with_parts else f"{asdict(config.watertight)} without parts"
     digest = hashlib.sha256(f"{CACHE_VERSION} {parameters}".encode())
     digest.update(np.ascontiguousarray(verts, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(faces, dtype="<i8").tobytes())
     return digest.hexdigest()
 
 
-def cached_solid(
+def cached_watertight(
     mesh: ObjectMesh,
     config: PreparationConfig,
     cache_dir: Path,
     *,
     source: object,
     with_parts: bool = True,
-) -> Solid:
-    """`make_solid`, kept in `cache_dir` under the hash of vertices, faces and parameters.
+) -> WatertightMesh:
+    """`make_watertight`, kept in `cache_dir` under the hash of vertices, faces and parameters.
 
     A damaged entry is made again. Several processes may share the folder.
     """
     path = cache_dir / f"{_key(mesh.verts_obj, mesh.faces, config, with_parts)}.npz"
     if path.is_file():
         try:
-            return solid_from_bytes(path.read_bytes())
+            return watertight_from_bytes(path.read_bytes())
         except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile):
             path.unlink(missing_ok=True)
-    # Made from bytes in both cases, so the first load and later ones are equal to the bit.
-    data = solid_to_bytes(make_solid(mesh, config, source=source, with_parts=with_parts))
+    # Made from bytes in both cases, so the first load and later ones are equal bit-exactly.
+    data = watertight_to_bytes(make_watertight(mesh, config, source=source, with_parts=with_parts))
     cache_dir.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(f".{os.getpid()}.partial")
     partial.write_bytes(data)
     partial.replace(path)
-    return solid_from_bytes(data)
+    return watertight_from_bytes(data)
 
 
-def solid_to_bytes(solid: Solid) -> bytes:
-    """An .npz with fixed dates: equal solids give equal bytes. Vertices are float32."""
+def watertight_to_bytes(watertight: WatertightMesh) -> bytes:
+    """An .npz with fixed dates: equal watertight meshes give equal bytes. Vertices are float32."""
     no_verts, no_faces = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     arrays: dict[str, np.ndarray] = {
-        "verts": solid.verts_obj.astype("<f4"),
-        "faces": solid.faces.astype("<u2" if len(solid.verts_obj) < 65536 else "<u4"),
-        "watertight_source": np.array(solid.watertight_source),
-        "part_verts": np.concatenate([no_verts, *(part.verts_obj for part in solid.parts)]).astype("<f4"),
-        "part_faces": np.concatenate([no_faces, *(part.faces for part in solid.parts)]).astype("<u2"),
+        "verts": watertight.verts_obj.astype("<f4"),
+        "faces": watertight.faces.astype("<u2" if len(watertight.verts_obj) < 65536 else "<u4"),
+        "watertight_source": np.array(watertight.watertight_source),
+        "part_verts": np.concatenate([no_verts, *(part.verts_obj for part in watertight.parts)]).astype(
+            "<f4"
+        ),
+        "part_faces": np.concatenate([no_faces, *(part.faces for part in watertight.parts)]).astype("<u2"),
         "part_sizes": np.array(
-            [(len(part.verts_obj), len(part.faces)) for part in solid.parts], dtype="<u2"
+            [(len(part.verts_obj), len(part.faces)) for part in watertight.parts], dtype="<u2"
         ).reshape(-1, 2),
     }
-    if solid.fit is not None:
-        arrays["fit"] = np.array(list(asdict(solid.fit).values()), dtype="<f8")
+    if watertight.fit is not None:
+        arrays["fit"] = np.array(list(asdict(watertight.fit).values()), dtype="<f8")
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, array in arrays.items():
@@ -181,8 +183,8 @@ def solid_to_bytes(solid: Solid) -> bytes:
     return buffer.getvalue()
 
 
-def solid_from_bytes(data: bytes) -> Solid:
-    """Inverse of `solid_to_bytes` up to float32."""
+def watertight_from_bytes(data: bytes) -> WatertightMesh:
+    """Inverse of `watertight_to_bytes` up to float32."""
     with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
         part_verts, part_faces = arrays["part_verts"], arrays["part_faces"]
         ends = np.cumsum(arrays["part_sizes"].astype(np.int64), axis=0)
@@ -194,12 +196,12 @@ def solid_from_bytes(data: bytes) -> Solid:
             )
             for start, end in zip(starts, ends)
         )
-        return Solid(
+        return WatertightMesh(
             verts_obj=arrays["verts"].astype(np.float64),
             faces=arrays["faces"].astype(np.int64),
             parts=parts,
             watertight_source=bool(arrays["watertight_source"]),
-            fit=SolidFit(**dict(zip(SolidFit.__dataclass_fields__, map(float, arrays["fit"]))))
+            fit=WatertightFit(**dict(zip(WatertightFit.__dataclass_fields__, map(float, arrays["fit"]))))
             if "fit" in arrays
             else None,
         )

@@ -12,13 +12,19 @@ from datagen.objects.errors import ObjectError
 from datagen.objects.mesh.surface_points import face_areas, face_normals
 from datagen.objects.watertight.level_set import LevelSetConfig, level_set_surface
 
-__all__ = ["ClosedSurface", "SolidConfig", "closed_surface", "decimated_closed", "signed_distance"]
+__all__ = [
+    "WatertightConfig",
+    "WatertightSurface",
+    "decimated_watertight",
+    "signed_distance",
+    "watertight_surface",
+]
 
 MAX_COMPONENTS = 400  # more are remeshed: their union costs more than a level set
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolidConfig:
+class WatertightConfig:
     """How closed surfaces are made."""
 
     level_set: LevelSetConfig
@@ -27,7 +33,7 @@ class SolidConfig:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ClosedSurface:
+class WatertightSurface:
     """A 2-manifold without boundary, outward faces, object frame, metres."""
 
     verts_obj: Float[np.ndarray, "vert 3"]
@@ -35,35 +41,35 @@ class ClosedSurface:
     watertight_source: bool  # made of the drawn triangles, not of a level set
 
 
-def closed_surface(
+def watertight_surface(
     verts_obj: Float[np.ndarray, "vert 3"],
     faces: Int[np.ndarray, "face 3"],
-    config: SolidConfig,
+    config: WatertightConfig,
     *,
     source: object,
-) -> ClosedSurface:
-    """Closed version of a mesh with outward faces. ObjectError where nothing solid is left."""
-    solid = _union_of_closed_parts(verts_obj, faces)
-    watertight_source = solid is not None
-    if solid is None:
+) -> WatertightSurface:
+    """Closed version of a mesh with outward faces. ObjectError where nothing watertight mesh is left."""
+    watertight = _union_of_closed_parts(verts_obj, faces)
+    watertight_source = watertight is not None
+    if watertight is None:
         level_verts, level_faces = level_set_surface(verts_obj, faces, config.level_set)
-        solid = _manifold(level_verts, level_faces)
-        if solid is not None:
-            solid = _without_voids_and_crumbs(solid, config.level_set.voxel_m(verts_obj))
-    if solid is None or solid.is_empty() or solid.volume() <= 0:
+        watertight = _manifold(level_verts, level_faces)
+        if watertight is not None:
+            watertight = _without_voids_and_crumbs(watertight, config.level_set.voxel_m(verts_obj))
+    if watertight is None or watertight.is_empty() or watertight.volume() <= 0:
         raise ObjectError(
             source,
             "encloses no volume",
             expected="an object with some thickness",
             action="Check the mesh in a viewer; give sheets a thickness.",
         )
-    mesh = _simplified(solid, config).to_mesh64()
-    closed_verts, closed_faces = decimated_closed(
+    mesh = _simplified(watertight, config).to_mesh64()
+    closed_verts, closed_faces = decimated_watertight(
         np.array(mesh.vert_properties[:, :3], dtype=np.float64),
         np.array(mesh.tri_verts, dtype=np.int64),
         config.max_faces,
     )
-    return ClosedSurface(
+    return WatertightSurface(
         verts_obj=closed_verts,
         faces=closed_faces,
         watertight_source=watertight_source,
@@ -75,8 +81,8 @@ def _manifold(verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3
     if len(faces) < 4:
         return None
     mesh = Mesh64(np.ascontiguousarray(verts), np.ascontiguousarray(faces.astype(np.uint64)))
-    solid = Manifold(mesh)
-    return solid if solid.status() == Error.NoError and not solid.is_empty() else None
+    watertight = Manifold(mesh)
+    return watertight if watertight.status() == Error.NoError and not watertight.is_empty() else None
 
 
 def _union_of_closed_parts(
@@ -90,14 +96,14 @@ def _union_of_closed_parts(
     for part in range(n_parts):
         used, local = np.unique(faces[part_of_face == part], return_inverse=True)
         local = local.reshape(-1, 3)
-        solid = _manifold(verts[used], local)
-        if solid is None:
+        watertight = _manifold(verts[used], local)
+        if watertight is None:
             return None
-        if solid.volume() < 0:  # a shell that faces inward is a cavity: filled
-            solid = _manifold(verts[used], local[:, ::-1])
-        if solid is None or not _is_clean(verts[used], local):
+        if watertight.volume() < 0:  # a shell that faces inward is a cavity: filled
+            watertight = _manifold(verts[used], local[:, ::-1])
+        if watertight is None or not _is_clean(verts[used], local):
             return None
-        parts.append(solid)
+        parts.append(watertight)
     union = Manifold.batch_boolean(parts, OpType.Add) if len(parts) > 1 else parts[0]
     return None if union.is_empty() else _without_voids_and_crumbs(union, 0.0)
 
@@ -115,22 +121,22 @@ def _is_clean(verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3
     return float(areas[bad].sum()) <= 1e-3 * float(areas.sum())
 
 
-def _without_voids_and_crumbs(solid: Manifold, voxel_m: float) -> Manifold:
+def _without_voids_and_crumbs(watertight: Manifold, voxel_m: float) -> Manifold:
     """Drop inner cavities (negative volume) and specks of less than eight voxels."""
-    components = solid.decompose()
+    components = watertight.decompose()
     volumes = [component.volume() for component in components]
     least = max(8 * voxel_m**3, 1e-9 * max(volumes))
     kept = [component for component, volume in zip(components, volumes) if volume > least]
     return Manifold.compose(kept)
 
 
-def _simplified(solid: Manifold, config: SolidConfig) -> Manifold:
-    solid = solid.as_original()
-    simple = solid.simplify(config.tolerance_m)
-    return solid if simple.is_empty() or simple.volume() <= 0 else simple
+def _simplified(watertight: Manifold, config: WatertightConfig) -> Manifold:
+    watertight = watertight.as_original()
+    simple = watertight.simplify(config.tolerance_m)
+    return watertight if simple.is_empty() or simple.volume() <= 0 else simple
 
 
-def decimated_closed(
+def decimated_watertight(
     verts: Float[np.ndarray, "vert 3"], faces: Int[np.ndarray, "face 3"], max_faces: int
 ) -> tuple[Float[np.ndarray, "out_vert 3"], Int[np.ndarray, "out_face 3"]]:
     """Quadric decimation of a closed surface; given back unchanged where it would not stay closed."""

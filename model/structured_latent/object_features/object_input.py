@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from model.data.batch import Batch, ObjectSurface, SurfaceBatch
+from model.data.batch import Batch, SurfaceBatch, SurfaceTarget
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
 from model.structured_latent.object_features.surface_features import VoxelFeatures, object_features
@@ -66,7 +66,7 @@ class ObjectInputs:
             for uid, occupancy, is_mirrored in zip(truth.object_uids, batch.occupancy, truth.are_mirrored)
         ]
 
-    def _features(self, occupancy: Bool[np.ndarray, "i j k"], surface: ObjectSurface) -> VoxelFeatures:
+    def _features(self, occupancy: Bool[np.ndarray, "i j k"], surface: SurfaceTarget) -> VoxelFeatures:
         digest = hashlib.blake2b(np.packbits(occupancy).tobytes(), digest_size=16)
         for samples in (
             surface.points,
@@ -83,10 +83,10 @@ class ObjectInputs:
         )
 
 
-def object_surface(truth: SurfaceBatch, sample: int) -> ObjectSurface:
+def object_surface(truth: SurfaceBatch, sample: int) -> SurfaceTarget:
     """The surface of one sample of a batch."""
     part = truth.part(sample, sample + 1)
-    return ObjectSurface(
+    return SurfaceTarget(
         points=part.points.cpu().numpy(),
         normals=part.normals.cpu().numpy(),
         colors=part.colors.cpu().numpy(),

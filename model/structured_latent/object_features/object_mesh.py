@@ -15,7 +15,7 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from model.errors import ModelError
 from model.surface.export import ROTATION_YUP_FROM_OBJ
 from shards.errors import DatasetNotFoundError
-from shards.reader import Shard, Table
+from shards.reader import ColumnTable, Shard
 from shards.schema import ObjectRow
 from shards.storage.parquet import ParquetSource
 
@@ -114,7 +114,7 @@ class ObjectMeshes:
         source = shard.source("objects")
         names = ["object_uid", "mesh_sha256", "T_objmesh_from_canonical"]
         for group in range(source.num_row_groups):
-            table = Table(source.read_row_group(group, names), ObjectRow, where=source.path)
+            table = ColumnTable(source.read_row_group(group, names), ObjectRow, where=source.path)
             for row, uid in enumerate(table["object_uid"]):
                 self._found.setdefault(
                     uid,

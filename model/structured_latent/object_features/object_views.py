@@ -1,6 +1,6 @@
-"""Pictures of the clean object from all sides, of which features are made (FORMATS 4.5).
+"""Images of the clean object from all sides, of which features are made (FORMATS 4.5).
 
-TRELLIS: 150 cameras of a Hammersley sphere at radius 2, 40 degrees wide, colours on black. Its pictures are path
+TRELLIS: 150 cameras of a Hammersley sphere at radius 2, 40 degrees wide, colours on black. Its images are path
 traced; ours show the base colours under a lamp at the camera, so that a shape of one colour is more than a silhouette.
 """
 
@@ -23,7 +23,7 @@ FOV_DEG, RADIUS = 40.0, 2.0  # canonical units
 AMBIENT = 0.5  # share of the light that comes from everywhere
 REFLECTANCE = 0.04  # of what is not metal: black things do not vanish before the black
 RENDERING = f"views 1: {FOV_DEG} {RADIUS} {AMBIENT} {REFLECTANCE}"
-"""Changes with anything that changes the pictures of an object: part of what a cached feature is known by."""
+"""Changes with anything that changes the images of an object: part of what a cached feature is known by."""
 
 _MAX_LEVELS = 16  # of an image of 65,535 texels across
 _LINEAR = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
@@ -31,14 +31,14 @@ _LINEAR = linear_from_srgb(np.arange(256, dtype=np.float32) / 255)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjectView:
-    """One picture and its camera."""
+    """One image and its camera."""
 
     image: UInt8[np.ndarray, "size size 3"]  # sRGB times coverage
     K: Float[np.ndarray, "3 3"]
     T_cam_from_canonical: Float[np.ndarray, "4 4"]
 
     def mirrored(self) -> "ObjectView":
-        """The picture of the object in the mirror, x -> -x as `model.data.crop.mirrored`: its own inverse."""
+        """The image of the object in the mirror, x -> -x as `model.data.crop.mirrored`: its own inverse."""
         F = np.diag([-1.0, 1.0, 1.0, 1.0])
         K = self.K.copy()
         K[0, 2] = self.image.shape[1] - K[0, 2]
@@ -64,14 +64,14 @@ def sphere_cameras(count: int) -> Float[np.ndarray, "view 4 4"]:
 
 
 def object_views(mesh: TexturedMesh, count: int, image_size: int, supersampling: int) -> Iterator[ObjectView]:
-    """The pictures of the object, one after the other; sides rendered larger by `supersampling`, then averaged."""
+    """The images of the object, one after the other; sides rendered larger by `supersampling`, then averaged."""
     large = image_size * supersampling
     K = intrinsics_from_fov(np.deg2rad(FOV_DEG), (image_size, image_size))
     K_large = intrinsics_from_fov(np.deg2rad(FOV_DEG), (large, large))
     pyramids = [_pyramid(texture) for texture in mesh.textures]
     for T_cam_from_canonical in sphere_cameras(count):
-        picture = _picture(mesh, pyramids, K_large, T_cam_from_canonical, large)
-        blocks = picture.reshape(image_size, supersampling, image_size, supersampling, 3)
+        image = _image(mesh, pyramids, K_large, T_cam_from_canonical, large)
+        blocks = image.reshape(image_size, supersampling, image_size, supersampling, 3)
         yield ObjectView(
             image=np.round(255.0 * blocks.mean(axis=(1, 3))).astype(np.uint8),
             K=K,
@@ -82,7 +82,7 @@ def object_views(mesh: TexturedMesh, count: int, image_size: int, supersampling:
 _Pyramid = list[UInt8[np.ndarray, "_ _ 3"]]
 
 
-def _picture(
+def _image(
     mesh: TexturedMesh,
     pyramids: list[_Pyramid],
     K: Float[np.ndarray, "3 3"],
@@ -108,13 +108,13 @@ def _picture(
     color = mixed(mesh.colors)
     choice, uv = mesh.face_texture[face] * _MAX_LEVELS + level, mixed(mesh.uv)
     for found in np.flatnonzero(np.bincount(choice)):
-        image = pyramids[found // _MAX_LEVELS][found % _MAX_LEVELS]
+        level_image = pyramids[found // _MAX_LEVELS][found % _MAX_LEVELS]
         pixels = np.flatnonzero(choice == found)
-        color[pixels] *= _texels(image, uv[pixels])
-    picture = np.zeros((size, size, 3), dtype=np.float32)
+        color[pixels] *= _texels(level_image, uv[pixels])
+    image = np.zeros((size, size, 3), dtype=np.float32)
     light = AMBIENT + (1.0 - AMBIENT) * facing
-    picture[hit] = srgb_from_linear((REFLECTANCE + (1.0 - REFLECTANCE) * color) * light[:, None])
-    return picture
+    image[hit] = srgb_from_linear((REFLECTANCE + (1.0 - REFLECTANCE) * color) * light[:, None])
+    return image
 
 
 def _pyramid(texture: UInt8[np.ndarray, "height width 3"]) -> _Pyramid:

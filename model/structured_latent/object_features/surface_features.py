@@ -7,10 +7,10 @@ The signed distance at a corner is extrapolated from the nearest sample, value +
 Samples are the surface points (value 0, their normal) and the signed-distance samples; the gradient of one of
 these is the normal of that of the four nearest surface points whose plane explains its value best.
 
-How exact: against the solids of the 48 starter objects (8,192 surface and 12,288 distance samples each) the mean
-error is 0.06 voxels (median over objects 0.03, worst 0.23: an object of thin bars), the 95th percentile 0.3, and
-2.2 % of the corners further than 0.1 voxels from the surface are on the wrong side (worst 12 %). 47 % of the active
-voxels hold no surface point (worst 85 %). It takes 0.13 s per object.
+How exact: against the watertight versions of the 48 starter objects (8,192 surface and 12,288 distance samples
+each) the mean error is 0.06 voxels (median over objects 0.03, worst 0.23: an object of thin bars), the
+95th percentile 0.3, and 2.2 % of the corners further than 0.1 voxels from the surface are on the wrong side (worst
+12 %). 47 % of the active voxels hold no surface point (worst 85 %). It takes 0.13 s per object.
 """
 
 from collections.abc import Iterable
@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from model.data.batch import ObjectSurface
+from model.data.batch import SurfaceTarget
 from model.encoders.protocol import FeatureEncoder
 from model.errors import ModelError
 from model.structured_latent.object_features.object_views import ObjectView
@@ -73,7 +73,7 @@ class VoxelFeatures:
 
 
 def object_features(
-    surface: ObjectSurface, voxels: Int[np.ndarray, "voxel 3"], resolution: int
+    surface: SurfaceTarget, voxels: Int[np.ndarray, "voxel 3"], resolution: int
 ) -> VoxelFeatures:
     """Features of active voxels from the samples of the object's surface; deterministic.
 
@@ -112,7 +112,7 @@ def object_features(
 
 
 def corner_distances(
-    surface: ObjectSurface, points: Float[np.ndarray, "point 3"]
+    surface: SurfaceTarget, points: Float[np.ndarray, "point 3"]
 ) -> Float[np.ndarray, " point"]:
     """Signed distance at points near the surface, from the nearest sample; canonical units, negative inside."""
     of_surface = KDTree(surface.points)
@@ -145,7 +145,7 @@ class ProjectedFeatures:
     """Image features on voxels."""
 
     features: Float[Tensor, "voxel channel"]  # zero where `views` is 0
-    views: Int[Tensor, " voxel"]  # that show the voxel's centre inside the picture, in front of the camera
+    views: Int[Tensor, " voxel"]  # that show the voxel's centre inside the image, in front of the camera
 
 
 @torch.no_grad()
@@ -158,8 +158,8 @@ def projected_features(
     """Mean over the views of the bilinear features at the voxel centres' projections (FORMATS 4.5).
 
     Without a visibility test, as TRELLIS: a voxel on the far side gets the features in front of it. Views that show
-    the centre outside the picture do not count (TRELLIS, whose views show the whole object, counts them as zero).
-    Float32, on the device of `voxels`, where the encoder is too; the pictures are of the whole unoccluded object.
+    the centre outside the image do not count (TRELLIS, whose views show the whole object, counts them as zero).
+    Float32, on the device of `voxels`, where the encoder is too; the images are of the whole unoccluded object.
     """
     device, rest = voxels.device, iter(views)
     centers = (voxels.float() + 0.5) / resolution - 0.5
@@ -183,7 +183,7 @@ def projected_features(
 def _projected(
     points: Float[Tensor, "point 3"], view: ObjectView
 ) -> tuple[Float[Tensor, "point 2"], Bool[Tensor, " point"]]:
-    """Projections in -1..1 over the picture, and whether they are inside and in front of the camera."""
+    """Projections in -1..1 over the image, and whether they are inside and in front of the camera."""
     T, K = (torch.from_numpy(matrix).to(points) for matrix in (view.T_cam_from_canonical, view.K))
     points_cam = points @ T[:3, :3].T + T[:3, 3]
     in_front = points_cam[:, 2] > 0

@@ -2,7 +2,7 @@
 
     CACHE/ab/abcdef....safetensors    float16, as TRELLIS keeps them: `plain` and `mirrored`, voxels x channels
 
-The file's name is a digest of everything that decides its content: mesh, frame, voxels, pictures and encoder.
+The file's name is a digest of everything that decides its content: mesh, frame, voxels, images and encoder.
 """
 
 import hashlib
@@ -30,13 +30,13 @@ _PLAIN, _MIRRORED = "plain", "mirrored"
 
 @dataclass(frozen=True, kw_only=True)
 class ViewFeaturesConfig:
-    """Features of the configured image encoder, of pictures of the clean object (`object_views`).
+    """Features of the configured image encoder, of images of the clean object (`object_views`).
 
     | field         | TRELLIS | meaning |
     |---------------|---------|---------|
     | views         | 150     | cameras around the object |
     | image_size    | 518     | px |
-    | supersampling | -       | pictures are rendered larger by this factor; 1: four times faster, jagged |
+    | supersampling | -       | images are rendered larger by this factor; 1: four times faster, jagged |
     | cache         | -       | folder of what is made, for all runs; null: kept in memory as far as 1 GiB goes |
     """
 
@@ -86,8 +86,8 @@ class ViewFeatures:
     def _made(self, record: MeshRecord, occupancy: Bool[np.ndarray, "i j k"]) -> dict[str, Tensor]:
         """Both, since rendering takes longest."""
         settings = self.config
-        pictures = object_views(record.read(), settings.views, settings.image_size, settings.supersampling)
-        views = list(pictures)
+        images = object_views(record.read(), settings.views, settings.image_size, settings.supersampling)
+        views = list(images)
         made = {}
         for name, shown, voxels in (
             (_PLAIN, views, occupancy),

@@ -148,7 +148,7 @@ def test_hidden_object_has_an_amodal_mask_only():
 
 
 def test_closed_form_table_equals_its_mesh():
-    """The same picture whether the flat top is met in closed form or by rays."""
+    """The same image whether the flat top is met in closed form or by rays."""
     slab = table_mesh(TABLE)
     as_mesh = trimesh.Trimesh(slab.verts_world, slab.faces, process=False)
     assert as_mesh.is_watertight

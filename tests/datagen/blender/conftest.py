@@ -78,7 +78,7 @@ def box_scene() -> Scene:
 
 @pytest.fixture(scope="session")
 def emissive_scene(box_scene) -> Scene:
-    """The object alone, glowing in the dark: its picture is its mask, filtered."""
+    """The object alone, glowing in the dark: its image is its mask, filtered."""
     return _emissive_scene(box_scene)
 
 

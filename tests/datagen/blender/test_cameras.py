@@ -84,14 +84,14 @@ def test_silhouettes_are_the_projected_outlines(passes, box_scene):
 
 
 @pytest.mark.blender
-def test_pictures_agree_with_masks_to_a_tenth_of_a_pixel(render, emissive_scene, tmp_path):
+def test_images_agree_with_masks_to_a_tenth_of_a_pixel(render, emissive_scene, tmp_path):
     scene = emissive_scene
     done = render(scene, tmp_path / "glow")
     assert done.status == 0, done.stderr
     for event in [e for e in done.events if e["event"] == "frame"]:
         camera = scene.cameras[event["camera"]]
-        picture = np.asarray(Image.open(tmp_path / "glow" / event["path"]), np.float64)[..., 0] / 255.0
-        linear = np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
+        image = np.asarray(Image.open(tmp_path / "glow" / event["path"]), np.float64)[..., 0] / 255.0
+        linear = np.where(image <= 0.04045, image / 12.92, ((image + 0.055) / 1.055) ** 2.4)
         T_cam_from_obj = camera.T_cam_from_world[event["frame"]] @ scene.T_world_from_obj[event["frame"]]
         outline = project_points(transform_points(T_cam_from_obj, scene.object_mesh.verts_obj), camera.K)
         moments = cv2.moments(cv2.convexHull(outline.astype(np.float32)))

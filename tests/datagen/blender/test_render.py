@@ -31,7 +31,7 @@ def test_standard_output_is_the_protocol_and_nothing_else(rendered, box_scene):
     assert done.other_lines == []
     assert [event["event"] for event in done.events] == ["start", *["frame"] * 4, "done"]
     start, *frames, end = done.events
-    assert (start["pictures"], start["skipped"], end["rendered"]) == (4, 0, 4)
+    assert (start["images"], start["skipped"], end["rendered"]) == (4, 0, 4)
     assert [(e["frame"], e["camera"]) for e in frames] == [(0, 0), (0, 1), (1, 0), (1, 1)]
     assert end["device"] in ("CPU", "OPTIX", "CUDA", "HIP", "METAL")
     assert end["bpy_version"].startswith("4.5")
@@ -39,9 +39,9 @@ def test_standard_output_is_the_protocol_and_nothing_else(rendered, box_scene):
     assert all(set(e["seconds"]) == {"sync", "render", "write"} for e in frames)
     for event in frames:
         size = box_scene.cameras[event["camera"]].image_size
-        picture = Image.open(frames_dir / event["path"])
-        assert (picture.mode, picture.size) == ("RGB", size)
-        assert np.asarray(picture).std() > 10.0
+        image = Image.open(frames_dir / event["path"])
+        assert (image.mode, image.size) == ("RGB", size)
+        assert np.asarray(image).std() > 10.0
 
 
 def test_a_resumed_run_makes_only_what_is_missing_and_the_same_bytes(rendered, render, box_scene):
@@ -56,7 +56,7 @@ def test_a_resumed_run_makes_only_what_is_missing_and_the_same_bytes(rendered, r
     assert {path: path.read_bytes() for path in frames_dir.glob("cam-*/frame*.png")} == before
 
 
-def test_pictures_of_another_scene_are_not_taken_for_ours(rendered, render, box_scene):
+def test_images_of_another_scene_are_not_taken_for_ours(rendered, render, box_scene):
     _, frames_dir = rendered
     kept = frames_dir / "cam-00" / "frame-0000.png"
     before = kept.read_bytes()
@@ -113,7 +113,7 @@ def test_a_truncated_scene_file_is_refused(rendering, box_scene, tmp_path):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="limits of a process")
-def test_a_picture_that_cannot_be_written_whole_ends_the_run(render, box_scene, tmp_path):
+def test_a_image_that_cannot_be_written_whole_ends_the_run(render, box_scene, tmp_path):
     def full_disk():
         resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))
 
@@ -125,7 +125,7 @@ def test_a_picture_that_cannot_be_written_whole_ends_the_run(render, box_scene, 
 
 
 @pytest.mark.slow
-def test_memory_does_not_grow_with_the_number_of_pictures(render, box_scene, tmp_path):
+def test_memory_does_not_grow_with_the_number_of_images(render, box_scene, tmp_path):
     n = 300
     few = dataclasses.replace(
         box_scene,
@@ -145,4 +145,4 @@ def test_memory_does_not_grow_with_the_number_of_pictures(render, box_scene, tmp
     done = render(few, tmp_path / "many")
     assert done.status == 0, done.stderr
     peaks = [event["peak_rss_mb"] for event in done.events if event["event"] == "frame"]
-    assert peaks[599] - peaks[99] < 5.0  # over 500 pictures
+    assert peaks[599] - peaks[99] < 5.0  # over 500 images

@@ -8,7 +8,7 @@ import trimesh
 
 from datagen.grasps.config import GraspConfig
 from datagen.hands.model import ShapedHand, load_open_hand, shape_hand
-from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, Solid
+from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, WatertightMesh
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
 from datagen.objects.mesh.texture_quality import TextureQuality
 
@@ -72,7 +72,7 @@ def convex_object(uid: str, mesh: trimesh.Trimesh) -> ObjectAsset:
             face_material=np.zeros(len(faces), dtype=int),
             materials=(Material(name="grey", base_color_rgba=(0.5, 0.5, 0.5, 1.0)),),
         ),
-        solid=Solid(
+        watertight=WatertightMesh(
             verts_obj=verts,
             faces=faces,
             parts=(ConvexPart(verts_obj=verts, faces=faces),),

@@ -77,7 +77,7 @@ def test_decoding_refuses_the_wrong_number_of_coefficients(skin: SkinBasis) -> N
 
 
 def test_basis_reproduces_the_mean_colour_of_every_source_skin(skin: SkinBasis) -> None:
-    """After JPEG and quantisation; the whole pictures agree to 1.2 of 255 on average."""
+    """After JPEG and quantisation; the whole images agree to 1.2 of 255 on average."""
     table = _table()
     assert len(skin.anchors) == len(table["mean_rgb"]) == 22
     used = _footprint(skin)

@@ -59,13 +59,13 @@ def test_object_contour_lies_on_the_border_of_its_mask():
     K = np.array([[100.0, 0.0, 40.0], [0.0, 100.0, 30.0], [0.0, 0.0, 1.0]])
     behind = np.diag([1.0, 1.0, 1.0, 1.0])
     behind[2, 3] = -1.0
-    picture = draw_labels(
+    image = draw_labels(
         np.zeros((height, width, 3), np.uint8), masks, np.full((21, 2), np.nan), behind, K, 0.1
     )
-    drawn = np.all(picture == OBJECT_COLOR, axis=-1)
+    drawn = np.all(image == OBJECT_COLOR, axis=-1)
     border = square & ~cv2.erode(square.astype(np.uint8), np.ones((3, 3))).astype(bool)
     assert drawn[border].mean() > 0.95
-    assert not picture[~cv2.dilate(square.astype(np.uint8), np.ones((5, 5))).astype(bool)].any()
+    assert not image[~cv2.dilate(square.astype(np.uint8), np.ones((5, 5))).astype(bool)].any()
 
 
 def test_command_writes_sheet_and_video_that_can_be_read(dataset, tmp_path):

@@ -64,15 +64,15 @@ def test_a_simulated_left_hand_grasps_the_object_itself(tmp_path: Path):
     assert -distances.min() <= sequence.quality.max_penetration_m + 1e-3
 
 
-def test_an_object_without_a_solid_stops_or_is_left_out_as_the_configuration_says(tmp_path, monkeypatch):
+def test_an_object_without_a_watertight_stops_or_is_left_out_as_the_configuration_says(tmp_path, monkeypatch):
     path = small_config(tmp_path)
     config = load_config(path)
 
-    def no_solid(self, uid):
+    def no_watertight(self, uid):
         raise ObjectError(uid, "encloses no volume", expected="some thickness", action="Give it one.")
 
     library = "datagen.objects.stores.library.MeshFolder.load"
-    monkeypatch.setattr(library, no_solid)
+    monkeypatch.setattr(library, no_watertight)
     with pytest.raises(ObjectError, match="encloses no volume"):
         load_object(config, line("folder/can.ply"))
     path.write_text(path.read_text().replace("unusable: stop", "unusable: remove"))

@@ -29,7 +29,7 @@ VARYING = {"render_seconds", "rgb"}
 def small_config(
     folder: Path, *, motions: int = 2, cameras: int = 2, frames: int = 2, size: int = 48
 ) -> Path:
-    """tiny.yaml on a folder of two plain objects, with few and small pictures."""
+    """tiny.yaml on a folder of two plain objects, with few and small images."""
     meshes = folder / "meshes"
     meshes.mkdir(parents=True)
     trimesh.creation.box((0.06, 0.05, 0.14)).export(meshes / "box.ply")

@@ -56,7 +56,7 @@ def annotate(folder: Path, uid: str, **values: object) -> None:
             path.write_bytes(gzip.compress(json.dumps(records).encode()))
 
 
-def test_everything_sound_is_kept_with_its_figures(own_inputs):
+def test_everything_sound_is_kept_with_its_metrics(own_inputs):
     selection = selected(own_inputs)
     assert len(selection.kept) == len(selection.decisions) == 6
     for decision in selection.decisions:
@@ -83,7 +83,7 @@ def test_everything_sound_is_kept_with_its_figures(own_inputs):
         (lambda c: c["selection"]["movement"].update(min_rotation_rad=0.5), Rule.MOVEMENT, None, "turns 0.000 rad"),
     ],
 )  # fmt: skip
-def test_a_threshold_removes_with_figures(own_inputs, change, rule, uid, reason):
+def test_a_threshold_removes_with_metrics(own_inputs, change, rule, uid, reason):
     selection = selected(own_inputs, change)
     removed = [d for d in selection.decisions if not d.kept]
     assert {d.rule for d in removed} == {rule.value}

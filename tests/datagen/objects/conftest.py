@@ -8,15 +8,15 @@ from datagen.objects.mesh.object_mesh import Material, ObjectMesh
 from datagen.objects.watertight.convex_parts import ConvexConfig
 from datagen.objects.watertight.level_set import LevelSetConfig
 from datagen.objects.watertight.preparation import PreparationConfig
-from datagen.objects.watertight.watertight_mesh import SolidConfig
+from datagen.objects.watertight.watertight_mesh import WatertightConfig
 
 Surface = tuple[np.ndarray, np.ndarray]
 
 
 @pytest.fixture
-def solid_config() -> SolidConfig:
+def watertight_config() -> WatertightConfig:
     """Coarse, so tests take a second: 1 mm on a 10 cm object."""
-    return SolidConfig(
+    return WatertightConfig(
         level_set=LevelSetConfig(voxels_longest=100, min_voxel_m=0.0003, max_hole_m=0.004, sheet_voxels=1.8),
         tolerance_m=5e-5,
         max_faces=12000,
@@ -24,7 +24,7 @@ def solid_config() -> SolidConfig:
 
 
 @pytest.fixture
-def quick_preparation(solid_config: SolidConfig) -> PreparationConfig:
+def quick_preparation(watertight_config: WatertightConfig) -> PreparationConfig:
     """One coarse convex part: for tests that are about loading."""
     convex = ConvexConfig(
         thresholds=(0.5,),
@@ -36,7 +36,7 @@ def quick_preparation(solid_config: SolidConfig) -> PreparationConfig:
         mcts_iterations=5,
         seed=0,
     )
-    return PreparationConfig(solid=solid_config, convex=convex)
+    return PreparationConfig(watertight=watertight_config, convex=convex)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from datagen.objects.formats.glb_export import mesh_to_glb
 from datagen.objects.mesh.graspable_size import scaled_mesh
 from datagen.objects.stores.library import StarterPack
 
-# Small textured starter objects whose solids are their own surfaces.
+# Small textured starter objects whose watertight meshes are their own surfaces.
 MODELS = ("starter/bread", "starter/rock_a", "starter/stone_lantern")
 GRASPXL_FACES = 3000
 # Smallest bbox side of each set; "large" as measured on the published examples, the others made up.
@@ -104,7 +104,7 @@ def graspxl_copy(
 ) -> Copy:
     """The object closed, decimated, turned, scaled and centred, as GraspXL's meshes are."""
     rotation = np.eye(3) if turn is None else turn
-    verts, faces = asset.solid.verts_obj, asset.solid.faces
+    verts, faces = asset.watertight.verts_obj, asset.watertight.faces
     if len(faces) > GRASPXL_FACES:
         verts, faces = fast_simplification.simplify(
             verts.astype(np.float32), faces.astype(np.int32), target_count=GRASPXL_FACES, agg=5

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from datagen.grasps.sequence import GraspQuality, GraspSequence, TableEdge
 from datagen.hands.model import ShapedHand, load_open_hand, pose_hand, shape_hand
 from datagen.hands.skin import SkinBasis
-from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, Solid
+from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, WatertightMesh
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
 from datagen.objects.mesh.texture_quality import TextureQuality
 from datagen.sampling.config import SamplingConfig
@@ -144,7 +144,7 @@ def asset() -> ObjectAsset:
             face_material=np.zeros(len(faces), dtype=int),
             materials=(Material(name="grey", base_color_rgba=(0.5, 0.5, 0.5, 1.0)),),
         ),
-        solid=Solid(
+        watertight=WatertightMesh(
             verts_obj=verts,
             faces=faces,
             parts=(ConvexPart(verts_obj=verts, faces=faces),),

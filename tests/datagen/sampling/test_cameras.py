@@ -196,18 +196,18 @@ def rngs(seed: int, n: int = 6) -> list[np.random.Generator]:
 
 def test_cameras_see_the_object_stay_clear_and_repeat():
     config, (subject, probe, around) = cameras_config(), ball_behind_a_plate()
-    cameras, figures = sample_cameras(config, subject, probe, around, rngs(3))
+    cameras, metrics = sample_cameras(config, subject, probe, around, rngs(3))
     again, _ = sample_cameras(config, subject, probe, around, rngs(3))
     assert len(cameras) == 6
-    for camera, same, figure in zip(cameras, again, figures):
+    for camera, same, metric in zip(cameras, again, metrics):
         np.testing.assert_array_equal(camera.T_cam_from_world, same.T_cam_from_world)
-        assert figure.visible_fraction_min >= config.min_visible
-        assert figure.min_margin_px >= config.margin * 256 - 1e-6
+        assert metric.visible_fraction_min >= config.min_visible
+        assert metric.min_margin_px >= config.margin * 256 - 1e-6
         assert camera_center(camera.T_cam_from_world)[:, 2].min() >= 0.2 + config.table_clearance_m
-    assert max(figure.attempts for figure in figures) > 1  # the plate hid the ball from some candidates
+    assert max(metric.attempts for metric in metrics) > 1  # the plate hid the ball from some candidates
 
 
-def test_a_hidden_object_is_an_error_with_figures():
+def test_a_hidden_object_is_an_error_with_metrics():
     subject, probe, around = ball_behind_a_plate()
     config = cameras_config(min_visible=0.999, min_visible_mean=0.999, min_object_size=0.9, attempts=3)
     with pytest.raises(SamplingError, match=r"none of 3 candidates.*object size / image 0\.\d+ < 0\.900"):

@@ -144,16 +144,16 @@ def test_the_report_proves_the_frustum(sample, config):
     for index in range(2):
         sampled = sample(index)
         side = min(config.cameras.image_size)
-        for camera, figures, report in zip(
-            sampled.scene.cameras, sampled.camera_figures, frustum_report(sampled.scene)
+        for camera, metrics, report in zip(
+            sampled.scene.cameras, sampled.camera_metrics, frustum_report(sampled.scene)
         ):
-            assert report.kind == camera.kind == figures.kind
+            assert report.kind == camera.kind == metrics.kind
             assert report.min_margin_px >= config.cameras.margin * side - 1e-6
             assert report.object_drift_px <= config.cameras.max_drift * side + 1e-6
-            assert abs(report.object_drift_px - figures.object_drift_px) < 1e-6
-            assert abs(report.visible_fraction_mean - figures.visible_fraction_mean) < 0.1
-            assert figures.visible_fraction_min >= config.cameras.min_visible
-            assert figures.attempts <= config.cameras.attempts
+            assert abs(report.object_drift_px - metrics.object_drift_px) < 1e-6
+            assert abs(report.visible_fraction_mean - metrics.visible_fraction_mean) < 0.1
+            assert metrics.visible_fraction_min >= config.cameras.min_visible
+            assert metrics.attempts <= config.cameras.attempts
             if sampled.scene.table is not None:
                 height = camera_center(camera.T_cam_from_world)[:, 2].min() - sampled.scene.table.top_z_m
                 assert height >= config.cameras.table_clearance_m
@@ -188,7 +188,7 @@ def test_movement_adds_turn_and_travel():
     assert abs(object_movement(T) - (np.pi / 2 + 2.0)) < 1e-9
 
 
-def test_what_cannot_be_drawn_is_an_error_with_figures(sample, make_sequence, hand, skins, asset, config):
+def test_what_cannot_be_drawn_is_an_error_with_metrics(sample, make_sequence, hand, skins, asset, config):
     with pytest.raises(SamplingError, match=r"too few for clips of 12 frames at .*raise clip\.fps"):
         sample(0, n_frames=130)
     with pytest.raises(SamplingError, match="pass the hand it was made with"):

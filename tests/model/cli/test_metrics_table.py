@@ -1,14 +1,14 @@
-"""The table shows a figure beside what it has to beat, and only there."""
+"""The table shows a metric beside what it has to beat, and only there."""
 
 import math
 
 from rich.console import Console
 
-from model.cli.metrics_table import figures_table
+from model.cli.metrics_table import metrics_table
 
 
 def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
-    figures = {
+    metrics = {
         "vae": {"voxel_iou": 0.7},
         "stage_one": {
             "voxel_iou": 0.66,
@@ -23,7 +23,7 @@ def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
     }
     console = Console(width=120)
     with console.capture() as capture:
-        console.print(figures_table("tiny: figures", figures, "caption"))
+        console.print(metrics_table("tiny: metrics", metrics, "caption"))
     lines = capture.get().splitlines()
     assert not any("mean_shape_iou" in line or "visible_iou" in line for line in lines)
     (vae,) = [line for line in lines if "vae" in line]
@@ -46,7 +46,7 @@ def test_stage_two_has_the_mean_latent_to_beat() -> None:
     console = Console(width=120)
     with console.capture() as capture:
         console.print(
-            figures_table("t", {"slat_flow": {"f_5mm": 98.9, "mean_latent_f_5mm": 92.1}}, "caption")
+            metrics_table("t", {"slat_flow": {"f_5mm": 98.9, "mean_latent_f_5mm": 92.1}}, "caption")
         )
     rows = [line for line in capture.get().splitlines() if "slat_flow" in line]
     assert len(rows) == 1

@@ -124,7 +124,7 @@ def test_a_clip_that_was_held_out_frames_by_number_and_a_box(runs, tmp_path):
     assert [(frame["index"], frame["choice"]) for frame in record["frames"]] == [(0, None), (3, None)]
     assert {frame["crop"]["origin"] for frame in record["frames"]} <= {"given box", "predicted masks"}
     assert record["scale"]["metres_per_unit"] > 0
-    assert "not the pictures" in record["scale"]["metres_from"]
+    assert "not the images" in record["scale"]["metres_from"]
 
 
 def test_no_object_found(runs, video, tmp_path):
@@ -163,5 +163,5 @@ def test_what_the_command_line_gets_wrong(runs, tmp_path, arguments, expected):
 
 def test_frames_and_boxes_that_do_not_exist(runs, video, tmp_path):
     assert "frame 12 does not exist" in refused(runs, tmp_path, video, "--frames", "0,12")
-    assert "outside of the picture" in refused(runs, tmp_path, video, "--box", "200,0,300,90")
+    assert "outside of the image" in refused(runs, tmp_path, video, "--box", "200,0,300,90")
     assert "no clip" in refused(runs, tmp_path, f"{runs.dataset}#nothing")

@@ -53,9 +53,9 @@ def finished(dataset, tmp_path_factory) -> tuple[Path, Path]:
     config = write_config(root / "small.yaml", small_settings(dataset))
     status, output = forehoi("train", config, "--out", root / "run")
     assert status == 0, output
-    for part, figure in (("vae", "voxel_iou"), ("hand_encoder", "hand_mask_iou"), ("stage_one", "mask_iou")):
-        assert figure in output
-        assert figure in json.loads((root / "run" / part / "figures.json").read_text())
+    for part, metric in (("vae", "voxel_iou"), ("hand_encoder", "hand_mask_iou"), ("stage_one", "mask_iou")):
+        assert metric in output
+        assert metric in json.loads((root / "run" / part / "metrics.json").read_text())
     return config, root / "run"
 
 

@@ -1,4 +1,4 @@
-"""Crop, roll and mirror: the geometry after it renders the picture after it."""
+"""Crop, roll and mirror: the geometry after it renders the image after it."""
 
 from dataclasses import replace
 

@@ -67,7 +67,7 @@ def test_moving_a_batch_keeps_geometry_in_float32(balls):
 
 
 def share_on_mask(points: np.ndarray, T: np.ndarray, K: np.ndarray, mask: np.ndarray) -> float:
-    """Share of the points whose pixel is on the mask; those outside the picture do not count."""
+    """Share of the points whose pixel is on the mask; those outside the image do not count."""
     cam = points @ np.float64(T[:3, :3]).T + T[:3, 3]
     x, y = np.floor((cam / cam[:, 2:]) @ np.float64(K[:2]).T).astype(int).T
     seen = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])

@@ -1,4 +1,4 @@
-"""A lopsided object of few voxels, and its exact picture: for tests that render again after a crop."""
+"""A lopsided object of few voxels, and its exact image: for tests that render again after a crop."""
 
 import cv2
 import numpy as np

@@ -1,4 +1,4 @@
-"""Batches and pictures for the encoders, drawn rather than rendered."""
+"""Batches and images for the encoders, drawn rather than rendered."""
 
 import torch
 from jaxtyping import Float
@@ -6,7 +6,7 @@ from jaxtyping import Float
 from model.data.batch import Batch
 
 
-def blob_picture(size: int, x: float, y: float, radius: float) -> Float[torch.Tensor, "3 size size"]:
+def blob_image(size: int, x: float, y: float, radius: float) -> Float[torch.Tensor, "3 size size"]:
     """Grey, with a red spot of `radius` at (x, y), all in fractions of the side."""
     centres = (torch.arange(size) + 0.5) / size
     spot = torch.exp(-0.5 * ((centres - x)[None, :] ** 2 + (centres - y)[:, None] ** 2) / radius**2)

@@ -26,7 +26,7 @@ class Means:
         return pooled.flatten(2).transpose(1, 2).unflatten(0, images.shape[:2])
 
 
-def test_each_picture_is_computed_once() -> None:
+def test_each_image_is_computed_once() -> None:
     inner = Means()
     cached = CachedEncoder(encoder=inner, max_views=100)
     assert isinstance(cached, FeatureEncoder)
@@ -38,7 +38,7 @@ def test_each_picture_is_computed_once() -> None:
     assert inner.asked == [5, 6, 6, 1]  # of these only the 5 by the cache
 
 
-def test_other_pictures_other_features_and_no_more_than_allowed() -> None:
+def test_other_images_other_features_and_no_more_than_allowed() -> None:
     inner = Means()
     cached = CachedEncoder(encoder=inner, max_views=2)
     images = torch.rand(1, 3, 3, 8, 8)

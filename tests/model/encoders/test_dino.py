@@ -10,7 +10,7 @@ from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel, Vi
 from model.encoders.dino import DinoConfig, DinoEncoder, load_dino
 from model.encoders.protocol import FeatureEncoder
 from model.errors import ModelError
-from tests.model.encoders.drawn import blob_picture
+from tests.model.encoders.drawn import blob_image
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_tokens_are_trelliss_conditioning_without_cls_and_registers(folder: Path
 def test_a_lit_patch_moves_its_own_token_most(folder: Path) -> None:
     encoder = loaded(folder, 140)
     row, column = 2, 7
-    with_spot = blob_picture(140, (column + 0.5) / 10, (row + 0.5) / 10, 0.02)
+    with_spot = blob_image(140, (column + 0.5) / 10, (row + 0.5) / 10, 0.02)
     tokens = encoder(torch.stack([torch.full_like(with_spot, 0.5), with_spot])[None])[0]
     change = (tokens[1] - tokens[0]).norm(dim=-1)
     assert encoder.grid == 10
@@ -74,9 +74,9 @@ def test_a_lit_patch_moves_its_own_token_most(folder: Path) -> None:
 
 def test_other_sizes_are_resized(folder: Path) -> None:
     encoder = loaded(folder, 140)
-    picture = blob_picture(280, 0.3, 0.6, 0.2)
-    small = torch.nn.functional.interpolate(picture[None], size=140, mode="bicubic", antialias=True)[0]
-    torch.testing.assert_close(encoder(picture[None, None]), encoder(small.clamp(0, 1)[None, None]))
+    image = blob_image(280, 0.3, 0.6, 0.2)
+    small = torch.nn.functional.interpolate(image[None], size=140, mode="bicubic", antialias=True)[0]
+    torch.testing.assert_close(encoder(image[None, None]), encoder(small.clamp(0, 1)[None, None]))
 
 
 def test_frozen_deterministic_and_in_bfloat16(folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""The open image encoder: really pretrained, frozen, aligned with the picture."""
+"""The open image encoder: really pretrained, frozen, aligned with the image."""
 
 import hashlib
 from pathlib import Path
@@ -13,7 +13,7 @@ from model.encoders.efficientnet import EfficientNetConfig, EfficientNetEncoder,
 from model.encoders.protocol import FeatureEncoder
 from model.encoders.token_grid import resized
 from model.errors import ModelError
-from tests.model.encoders.drawn import blob_picture
+from tests.model.encoders.drawn import blob_image
 
 IMAGENET = {"chelsea.png": {281, 282, 285}, "coffee.png": {967, 968}, "motorcycle_left.png": {665, 670}}
 """Tabby, tiger and Egyptian cat; espresso and cup; moped and scooter."""
@@ -28,10 +28,10 @@ def photograph(name: str) -> torch.Tensor:
     """The central square of a photograph of scikit-image at 224 px."""
     skimage = pytest.importorskip("skimage")
     io = pytest.importorskip("skimage.io")
-    picture = io.imread(Path(skimage.__file__).parent / "data" / name)[..., :3]
-    side = min(picture.shape[:2])
-    top, left = (picture.shape[0] - side) // 2, (picture.shape[1] - side) // 2
-    square = np.ascontiguousarray(picture[top : top + side, left : left + side])
+    image = io.imread(Path(skimage.__file__).parent / "data" / name)[..., :3]
+    side = min(image.shape[:2])
+    top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
+    square = np.ascontiguousarray(image[top : top + side, left : left + side])
     return resized(torch.from_numpy(square).permute(2, 0, 1)[None].float() / 255, 224)
 
 
@@ -49,12 +49,12 @@ def test_the_weights_recognise_photographs(name: str) -> None:
 @pytest.mark.parametrize("name", IMAGENET)
 def test_the_tensorflow_normalisation_is_surer_than_that_of_the_packages_readme(name: str) -> None:
     network = load_efficientnet(EfficientNetConfig(image_size=224, grid=16)).pyramid.network
-    picture = photograph(name)
+    image = photograph(name)
     mean, std = (torch.tensor(x).reshape(3, 1, 1) for x in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
     classes = sorted(IMAGENET[name])
     with torch.no_grad():
-        ours = network((255 * picture - 127) / 128).softmax(-1)[0, classes].sum()
-        readme = network((picture - mean) / std).softmax(-1)[0, classes].sum()
+        ours = network((255 * image - 127) / 128).softmax(-1)[0, classes].sum()
+        readme = network((image - mean) / std).softmax(-1)[0, classes].sum()
     assert float(ours) > float(readme)
 
 
@@ -92,8 +92,8 @@ def test_a_spot_changes_the_tokens_around_it(channels: slice) -> None:
     """Each stride (4, 8, 16, 32) sees things where they are, on average over places."""
     encoder = load_efficientnet(EfficientNetConfig(image_size=224, grid=28))
     places = [(x, y) for x in (0.4, 0.5, 0.6) for y in (0.4, 0.5, 0.6)]
-    pictures = [torch.full((3, 224, 224), 0.5), *(blob_picture(224, x, y, 0.02) for x, y in places)]
-    tokens = encoder(torch.stack(pictures)[None])[0, :, :, channels]
+    images = [torch.full((3, 224, 224), 0.5), *(blob_image(224, x, y, 0.02) for x, y in places)]
+    tokens = encoder(torch.stack(images)[None])[0, :, :, channels]
     change = (tokens[1:] - tokens[:1]).square().sum(-1).unflatten(
         1, (28, 28)
     ) ** 2  # ** 2: less of the far tail
@@ -103,13 +103,13 @@ def test_a_spot_changes_the_tokens_around_it(channels: slice) -> None:
     assert error.abs().max() < 0.5 / 28
 
 
-def test_shifting_the_picture_by_one_token_shifts_the_tokens_by_one() -> None:
+def test_shifting_the_image_by_one_token_shifts_the_tokens_by_one() -> None:
     """A token of the coarsest stride, so that every stride shifts by whole cells."""
     encoder = load_efficientnet(EfficientNetConfig(image_size=512, grid=16))
     generator = torch.Generator().manual_seed(0)
     noise = functional.interpolate(torch.rand(1, 3, 68, 68, generator=generator), size=544, mode="bicubic")
-    picture = noise[0].clamp(0, 1)
-    shifted = torch.stack([picture[:, :512, :512], picture[:, :512, 32:544]])  # moved one token left
+    image = noise[0].clamp(0, 1)
+    shifted = torch.stack([image[:, :512, :512], image[:, :512, 32:544]])  # moved one token left
     first, second = encoder(shifted[None])[0].unflatten(1, (16, 16))
     inner = slice(5, 11)
     aligned = (first[inner, 6:12] - second[inner, 5:11]).square().mean((0, 1))

@@ -15,7 +15,7 @@ from model.encoders.hand_training import HandLossConfig, HandTask, hand_losses, 
 from model.encoders.protocol import FeatureEncoder
 from model.errors import ModelError
 from model.training.task import Task
-from tests.model.encoders.drawn import blob_picture, hand_batch
+from tests.model.encoders.drawn import blob_image, hand_batch
 
 SMALL = HandNetConfig(image_size=64, stem=(8, 16), decoder=16)
 LOSS = HandLossConfig(object_weight=1.0, joint_weight=1.0, side_weight=0.1, sigma_cells=1.0, color_jitter=0.0)
@@ -102,7 +102,7 @@ def without_pyramid(net: HandNet) -> HandNet:
 
 @torch.no_grad()
 def test_the_layout_does_not_look_aside() -> None:
-    """With all kernels mirrored, a mirrored picture has mirrored features: only for centred cells."""
+    """With all kernels mirrored, a mirrored image has mirrored features: only for centred cells."""
     plain, mirrored = without_pyramid(network()), without_pyramid(network())
     for module in mirrored.modules():
         if isinstance(module, torch.nn.Conv2d):
@@ -116,7 +116,7 @@ def test_the_layout_does_not_look_aside() -> None:
 @torch.no_grad()
 def test_a_spot_changes_the_tokens_over_it_most() -> None:
     row, column = 5, 10
-    with_spot = blob_picture(64, (column + 0.5) / 16, (row + 0.5) / 16, 0.02)
+    with_spot = blob_image(64, (column + 0.5) / 16, (row + 0.5) / 16, 0.02)
     change = torch.zeros(256)
     for seed in range(8):
         tokens = without_pyramid(network(seed)).features(
@@ -183,14 +183,14 @@ def test_a_perfect_output_has_no_loss_and_full_marks() -> None:
     assert float(losses["joints"].max()) < 1e-4
     assert float(losses["side"].max()) < 1e-6
     evaluation = HandTask(network=Oracle(batch), config=LOSS).evaluate([batch])
-    assert evaluation.figures == {
+    assert evaluation.metrics == {
         "hand_mask_iou": 1.0,
         "held_object_iou": 1.0,
         "hand_side_accuracy": 1.0,
         "hand_pck5": 1.0,
         "hand_joint_error": pytest.approx(0, abs=0.3),
     }
-    assert evaluation.pictures["hand"].shape == (3 * 64, 6 * 64, 3)
+    assert evaluation.images["hand"].shape == (3 * 64, 6 * 64, 3)
 
 
 def test_joint_positions_are_finer_than_a_cell() -> None:
@@ -199,7 +199,7 @@ def test_joint_positions_are_finer_than_a_cell() -> None:
     torch.testing.assert_close(found, batch.joints_px.flatten(0, 1) / 64, rtol=0, atol=0.1 / 16)
 
 
-def test_joints_outside_the_picture_and_behind_the_camera_do_not_count() -> None:
+def test_joints_outside_the_image_and_behind_the_camera_do_not_count() -> None:
     batch = hand_batch(2, 1, 64, seed=3)
     with torch.no_grad():
         output = network()(batch.images.flatten(0, 1))
@@ -263,12 +263,12 @@ def test_it_learns_masks_and_joints() -> None:
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
-    figures = task.evaluate([hand_batch(16, 2, 64, seed=9)]).figures
-    assert figures["hand_mask_iou"] > 0.85, figures
-    assert figures["hand_pck5"] > 0.5, figures
-    assert figures["hand_side_accuracy"] > 0.9, figures
+    metrics = task.evaluate([hand_batch(16, 2, 64, seed=9)]).metrics
+    assert metrics["hand_mask_iou"] > 0.85, metrics
+    assert metrics["hand_pck5"] > 0.5, metrics
+    assert metrics["hand_side_accuracy"] > 0.9, metrics
 
 
 def test_evaluation_without_anything_to_measure_is_nan() -> None:
-    figures = HandTask(network=network(), config=LOSS).evaluate([]).figures
-    assert all(value != value for value in figures.values())
+    metrics = HandTask(network=network(), config=LOSS).evaluate([]).metrics
+    assert all(value != value for value in metrics.values())

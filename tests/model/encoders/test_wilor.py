@@ -23,7 +23,7 @@ from model.encoders.wilor import (
     load_wilor,
 )
 from model.errors import ModelError
-from tests.model.encoders.drawn import blob_picture
+from tests.model.encoders.drawn import blob_image
 
 TOY = WilorLayout(
     image_height=256, image_width=192, patch=16, channels=32, depth=3, heads=4, mlp_ratio=2, joints=16
@@ -184,7 +184,7 @@ def test_whole_crop_at_224_gives_14_by_14_tokens(checkpoint: Path) -> None:
 def test_a_lit_patch_moves_the_tokens_around_it_most(checkpoint: Path, grid: int) -> None:
     encoder = loaded(checkpoint, grid=grid)
     x, y = (9 * 16 + 6) / 224, (4 * 16 + 6) / 224  # centre of patch (4, 9): patches start 2 px outside
-    with_spot = blob_picture(224, x, y, 0.015)
+    with_spot = blob_image(224, x, y, 0.015)
     tokens = encoder(torch.stack([torch.full_like(with_spot, 0.5), with_spot])[None])[0]
     row, column = divmod(int((tokens[1] - tokens[0]).norm(dim=-1).argmax()), grid)
     assert abs((column + 0.5) / grid - x) <= 0.5 / grid

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from model.data.batch import ObjectSurface
+from model.data.batch import SurfaceTarget
 from model.evaluation.surface import point_score, sample_mesh, surface_score
 from model.surface.mesh import SurfaceMesh
 
@@ -18,10 +18,10 @@ def sphere(radius: float, color: float = 0.5) -> SurfaceMesh:
     )
 
 
-def true_sphere(radius: float, scale_m: float) -> ObjectSurface:
+def true_sphere(radius: float, scale_m: float) -> SurfaceTarget:
     normals = np.random.default_rng(1).standard_normal((8000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return ObjectSurface(
+    return SurfaceTarget(
         points=(radius * normals).astype(np.float32),
         normals=normals.astype(np.float32),
         colors=np.full((8000, 3), 128, np.uint8),

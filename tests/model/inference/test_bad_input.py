@@ -1,4 +1,4 @@
-"""Inputs as people have them: cut, turned, huge, grey, transparent, a single picture."""
+"""Inputs as people have them: cut, turned, huge, grey, transparent, a single image."""
 
 import json
 from pathlib import Path
@@ -78,7 +78,7 @@ def test_one_frame_of_4k_is_scaled_down_and_masks_are_not(runs, tmp_path):
         assert crop["corner_px"] == [840, 0]
 
 
-def test_grey_and_transparent_pictures(runs, tmp_path):
+def test_grey_and_transparent_images(runs, tmp_path):
     folder = tmp_path / "frames"
     folder.mkdir()
     rgb = numbered_frame(5)

@@ -41,7 +41,7 @@ def equal(a: Reconstruction, b: Reconstruction) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(arrays(a), arrays(b), strict=True))
 
 
-def test_the_surface_is_a_solid_and_every_stage_is_timed(result, networks):
+def test_the_surface_is_a_watertight_and_every_stage_is_timed(result, networks):
     assert result.surface is not None
     assert check_manifold(result.surface.mesh) == result.surface.report
     assert 0 < len(result.voxels) == result.occupancy.sum() < result.occupancy.size

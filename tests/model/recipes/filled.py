@@ -39,7 +39,7 @@ class Filled:
         for batch in batches:
             self.measured += batch.ids
             errors += (self.module.bias - _share(batch)).abs().tolist()
-        return Measurements(numbers={"error": errors}, pictures={})
+        return Measurements(numbers={"error": errors}, images={})
 
 
 def run(task: Task, dataset: Path, folder: Path, **stream: object) -> dict[str, float]:

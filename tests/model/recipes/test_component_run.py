@@ -1,4 +1,4 @@
-"""A part's streams, its figures, and that nothing is left running."""
+"""A part's streams, its metrics, and that nothing is left running."""
 
 import json
 import math
@@ -37,10 +37,10 @@ def test_one_pass_reads_each_training_motion_once_and_never_mirrored(tmp_path):
 
 
 @pytest.mark.slow
-def test_two_processes_share_the_validation_and_give_the_figures_of_one(tmp_path):
+def test_two_processes_share_the_validation_and_give_the_metrics_of_one(tmp_path):
     dataset = write_balls(tmp_path / "balls", splits=[["train", "train", "val", "val"]])
     alone = Filled()
-    figures = run(alone, dataset, tmp_path / "one")
+    metrics = run(alone, dataset, tmp_path / "one")
     command = [
         sys.executable,
         "-m",
@@ -58,8 +58,8 @@ def test_two_processes_share_the_validation_and_give_the_figures_of_one(tmp_path
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    shared = json.loads((tmp_path / "two" / "figures.json").read_text())
-    assert shared == pytest.approx(figures, rel=1e-6)  # weights differ in their last bits
+    shared = json.loads((tmp_path / "two" / "metrics.json").read_text())
+    assert shared == pytest.approx(metrics, rel=1e-6)  # weights differ in their last bits
     parts = [json.loads((tmp_path / "two" / f"measured-{rank}.json").read_text()) for rank in (0, 1)]
     assert [len(part) for part in parts] == [4, 2]  # batches 0 and 2, and batch 1
     assert sorted(parts[0] + parts[1]) == sorted(alone.measured)
@@ -67,21 +67,21 @@ def test_two_processes_share_the_validation_and_give_the_figures_of_one(tmp_path
 
 class _NothingToMeasure(Filled):
     def measure(self, batches: Iterable[Batch]) -> Measurements:
-        return Measurements(numbers={"known": [0.25 for _ in batches], "occluded": []}, pictures={})
+        return Measurements(numbers={"known": [0.25 for _ in batches], "occluded": []}, images={})
 
 
-def test_figures_are_strict_json(tmp_path):
-    """A figure that nothing was there for is null, and not a number again when it is read."""
+def test_metrics_are_strict_json(tmp_path):
+    """A metric that nothing was there for is null, and not a number again when it is read."""
     dataset = write_balls(tmp_path / "balls")
     for _ in range(2):  # trained, and found trained
-        figures = run(_NothingToMeasure(), dataset, tmp_path / "run")
-        assert figures["known"] == 0.25
-        assert math.isnan(figures["occluded"])
+        metrics = run(_NothingToMeasure(), dataset, tmp_path / "run")
+        assert metrics["known"] == 0.25
+        assert math.isnan(metrics["occluded"])
 
     def refuse(constant: str) -> None:
         raise AssertionError(f"{constant} is no JSON")
 
-    text = (tmp_path / "run" / "figures.json").read_text()
+    text = (tmp_path / "run" / "metrics.json").read_text()
     assert json.loads(text, parse_constant=refuse) == {"known": 0.25, "occluded": None}
 
 

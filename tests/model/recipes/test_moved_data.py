@@ -45,8 +45,8 @@ def test_a_run_goes_on_with_data_that_were_moved(root, elsewhere, tmp_path):
     assert status == 0, output
     state = json.loads((run / "stage_one" / "checkpoints" / "step-00000002" / "state.json").read_text())
     assert str(tmp_path / "there") in state["config_yaml"]
-    before = json.loads((root / "run" / "stage_one" / "figures.json").read_text())
-    assert json.loads((run / "stage_one" / "figures.json").read_text()) == before
+    before = json.loads((root / "run" / "stage_one" / "metrics.json").read_text())
+    assert json.loads((run / "stage_one" / "metrics.json").read_text()) == before
 
 
 @pytest.mark.parametrize("part", ["vae", "stage_one"])

@@ -63,14 +63,14 @@ def config(dataset) -> SlatTrainingConfig:
 
 def train(name: str, config: SlatTrainingConfig, folder: Path) -> tuple[dict[str, float], list[int]]:
     steps: list[int] = []
-    figures = train_slat_part(
+    metrics = train_slat_part(
         name,
         config,
         folder,
         accelerator=Accelerator(cpu=True),
         report=lambda report: steps.append(report.step),
     )
-    return figures, steps
+    return metrics, steps
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +78,9 @@ def finished(config, tmp_path_factory) -> Path:
     """The run of both parts. Do not change it."""
     folder = tmp_path_factory.mktemp("run")
     for name in SLAT_PARTS:
-        figures, steps = train(name, config, folder)
+        metrics, steps = train(name, config, folder)
         assert steps == [1, 2]
-        assert "f_5mm" in figures
+        assert "f_5mm" in metrics
     return folder
 
 
@@ -90,11 +90,11 @@ def weights(folder: Path) -> dict[str, torch.Tensor]:
     return load_file(newest / "weights.safetensors")
 
 
-def test_a_finished_run_trains_nothing_and_gives_its_figures(config, finished):
+def test_a_finished_run_trains_nothing_and_gives_its_metrics(config, finished):
     before = weights(finished / "slat_flow")
-    figures, steps = train("slat_flow", config, finished)
+    metrics, steps = train("slat_flow", config, finished)
     assert steps == []
-    assert "mean_latent_f_5mm" in figures
+    assert "mean_latent_f_5mm" in metrics
     after = weights(finished / "slat_flow")
     assert all(torch.equal(before[name], after[name]) for name in before)
 
@@ -121,7 +121,7 @@ def _stop_after_one_step(name: str, config: SlatTrainingConfig, folder: Path) ->
         train_slat_part(name, config, folder, accelerator=Accelerator(cpu=True), report=stop)
 
 
-def test_the_trained_flow_predicts_from_pictures(config, finished):
+def test_the_trained_flow_predicts_from_images(config, finished):
     task = load_slat_flow(config, finished, torch.device("cpu"))
     stream = ShardStream(replace(config.data, views=(2, 2)))
     batch = next(iter(stream))

@@ -14,7 +14,7 @@ from model.flow import Guidance, SamplerSettings, UniformTime
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.geometry_branch import GeometryBranchConfig
 from model.sparse_structure.mask_branch import MaskBranchConfig
-from model.sparse_structure.stage_one import FIGURES, StageOne, StageOneConfig, StageOneTask, mask_targets
+from model.sparse_structure.stage_one import METRICS, StageOne, StageOneConfig, StageOneTask, mask_targets
 from model.sparse_structure.vae import StructureVae, VaeConfig
 from model.sparse_structure.vae_training import turned
 from model.training.step_generators import sample_generators
@@ -121,18 +121,18 @@ def test_prediction_is_repeatable_and_has_the_sizes_of_its_inputs(task, batch):
 
 def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
     evaluation = task.evaluate([batch])
-    assert tuple(evaluation.figures) == FIGURES
-    assert evaluation.figures["visible_iou"] == pytest.approx(0.5)
-    assert evaluation.figures["occluded_visible_iou"] == pytest.approx(0.5)
-    assert evaluation.figures["occluded_mask_iou"] == evaluation.figures["mask_iou"]
+    assert tuple(evaluation.metrics) == METRICS
+    assert evaluation.metrics["visible_iou"] == pytest.approx(0.5)
+    assert evaluation.metrics["occluded_visible_iou"] == pytest.approx(0.5)
+    assert evaluation.metrics["occluded_mask_iou"] == evaluation.metrics["mask_iou"]
     batch.object_visible[:] = batch.object_amodal
-    assert math.isnan(task.evaluate([batch]).figures["occluded_mask_iou"])
-    assert 0.0 <= evaluation.figures["mask_iou"] <= 1.0
-    assert evaluation.pictures["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
+    assert math.isnan(task.evaluate([batch]).metrics["occluded_mask_iou"])
+    assert 0.0 <= evaluation.metrics["mask_iou"] <= 1.0
+    assert evaluation.images["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
 
 
 def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(task, batch):
-    assert math.isnan(task.evaluate([batch]).figures["found_visible_iou"])  # no network of ours
+    assert math.isnan(task.evaluate([batch]).metrics["found_visible_iou"])  # no network of ours
     network = HandNet(HandNetConfig(image_size=32, stem=(8, 8), decoder=8)).eval()
     encoder = HandEncoder(network=network, grid=2)
     sizes = replace(task.network.aggregator.config, hand_channels=encoder.channels)
@@ -145,9 +145,9 @@ def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(tas
         with torch.no_grad():  # the object everywhere, then nowhere
             network.maps.weight[1] = 0.0
             network.maps.bias[1] = bias
-        figures = looking.evaluate([batch]).figures
-        assert figures["found_visible_iou"] == pytest.approx(expected)
-        assert figures["occluded_found_visible_iou"] == pytest.approx(expected)
+        metrics = looking.evaluate([batch]).metrics
+        assert metrics["found_visible_iou"] == pytest.approx(expected)
+        assert metrics["occluded_found_visible_iou"] == pytest.approx(expected)
 
 
 def test_an_empty_prediction_is_counted_and_its_distance_is_finite(task, batch):
@@ -155,12 +155,12 @@ def test_an_empty_prediction_is_counted_and_its_distance_is_finite(task, batch):
     with torch.no_grad():
         bias = task.vae.decoder.out_layer[2].bias
         bias += 100 - bias.min()
-        full = task.evaluate([batch]).figures
+        full = task.evaluate([batch]).metrics
         bias -= 1000
-        figures = task.evaluate([batch]).figures
-    assert (full["empty"], figures["empty"]) == (0.0, 1.0)
-    assert full["chamfer"] < figures["chamfer"] == pytest.approx(math.sqrt(3))
-    assert figures["voxel_iou"] == 0.0
+        metrics = task.evaluate([batch]).metrics
+    assert (full["empty"], metrics["empty"]) == (0.0, 1.0)
+    assert full["chamfer"] < metrics["chamfer"] == pytest.approx(math.sqrt(3))
+    assert metrics["voxel_iou"] == 0.0
 
 
 def test_what_is_measured_on_a_batch_does_not_depend_on_the_batches_before_it(task, batch):
@@ -168,9 +168,9 @@ def test_what_is_measured_on_a_batch_does_not_depend_on_the_batches_before_it(ta
     first, second = one(batch, 0), one(batch, 1)
     together = task.measure([first, second]).numbers
     apart = [task.measure([part]).numbers for part in (second, first)]
-    assert together == {name: apart[1][name] + apart[0][name] for name in FIGURES}
+    assert together == {name: apart[1][name] + apart[0][name] for name in METRICS}
     assert together["chamfer"][0] != together["chamfer"][1]
-    assert task.evaluate([second, first]).figures == task.evaluate([first, second]).figures
+    assert task.evaluate([second, first]).metrics == task.evaluate([first, second]).metrics
 
 
 def test_mask_targets_are_plus_one_where_more_than_half_is_covered(batch):

@@ -25,7 +25,14 @@ from model.surface.fields import CHANNELS, CORNERS
 from model.training.step_generators import sample_generators
 from model.training.task import Task
 from tests.model.encoders.mean_color import MeanColor
-from tests.model.structured_latent.solids import ball, ball_distance, batch_of, plate, plate_distance, shell
+from tests.model.structured_latent.watertight_shapes import (
+    ball,
+    ball_distance,
+    batch_of,
+    plate,
+    plate_distance,
+    shell,
+)
 
 VAE = SlatVaeConfig(
     feature_channels=FEATURE_CHANNELS,
@@ -106,7 +113,7 @@ def test_both_are_tasks(vae_task, flow_task):
 
 
 def test_the_vae_learns_two_objects(vae_task, batch):
-    """Fifteen seconds of a core: both solids come back closed, with their colours, near their true surfaces."""
+    """Fifteen seconds of a core: both come back watertight, with their colours, near their true surfaces."""
     optimizer = torch.optim.AdamW(vae_task.module.parameters(), lr=1e-2, betas=(0.9, 0.99), weight_decay=0)
     first = None
     for step in range(60):
@@ -117,11 +124,11 @@ def test_the_vae_learns_two_objects(vae_task, batch):
         optimizer.step()
         optimizer.zero_grad()
     assert float(losses.total.detach()) < 0.35 * first
-    figures = vae_task.evaluate([batch]).figures
-    assert figures["f_5mm"] > 99
-    assert figures["manifold"] == 100
-    assert figures["normal_deg"] < 20
-    assert figures["color_error"] < 0.1
+    metrics = vae_task.evaluate([batch]).metrics
+    assert metrics["f_5mm"] > 99
+    assert metrics["manifold"] == 100
+    assert metrics["normal_deg"] < 20
+    assert metrics["color_error"] < 0.1
 
 
 def test_losses_reach_every_trained_parameter(vae_task, flow_task, batch):
@@ -177,21 +184,21 @@ def test_true_latents_come_back_through_normalisation(flow_task, batch):
 def test_the_table_shows_what_is_learned(flow_task, batch):
     evaluation = flow_task.evaluate([batch])
     for name in ("f_5mm", "mean_latent_f_5mm", "true_latent_f_5mm", "latent_error"):
-        assert name in evaluation.figures
-    picture = next(iter(evaluation.pictures.values()))
-    assert picture.shape == (2 * 192, 4 * 192, 3)
+        assert name in evaluation.metrics
+    image = next(iter(evaluation.images.values()))
+    assert image.shape == (2 * 192, 4 * 192, 3)
 
 
 def test_an_object_without_a_mesh_is_counted(flow_task, batch):
     decoded = flow_task.decoded(flow_task.clean_latent(batch)).decoded
     outside = decoded.with_features(torch.full_like(decoded.features, 3.0))
     truth = object_surface(batch.true_surface, 0)
-    figures = mean_scores([scored_mesh(outside, 0, truth, MESHES)])
-    assert figures["without_mesh"] == 1
-    assert figures["f_10mm"] == 0
-    assert figures["chamfer_cm"] == pytest.approx(200 * math.sqrt(3) * truth.object_scale_m)
-    assert math.isnan(figures["normal_deg"])  # not 0, which would be perfect
-    assert math.isnan(figures["handles"])
+    metrics = mean_scores([scored_mesh(outside, 0, truth, MESHES)])
+    assert metrics["without_mesh"] == 1
+    assert metrics["f_10mm"] == 0
+    assert metrics["chamfer_cm"] == pytest.approx(200 * math.sqrt(3) * truth.object_scale_m)
+    assert math.isnan(metrics["normal_deg"])  # not 0, which would be perfect
+    assert math.isnan(metrics["handles"])
 
 
 def test_a_pierced_surface_shows_in_its_handles(batch):
@@ -204,16 +211,16 @@ def test_a_pierced_surface_shows_in_its_handles(batch):
     flips = torch.from_numpy(np.where(wrong[tuple(np.moveaxis(corners, -1, 0))], -1.0, 1.0)).float()
     truth = object_surface(batch.true_surface, 0)
 
-    def figures(channels: torch.Tensor) -> dict[str, float]:
+    def metrics(channels: torch.Tensor) -> dict[str, float]:
         decoded = SparseTensor.from_samples([channels], [voxels], 64)
         return mean_scores([scored_mesh(decoded, 0, truth, MESHES)])
 
-    clean = figures(channels)
+    clean = metrics(channels)
     assert (clean["handles"], clean["components"], clean["manifold"]) == (0, 1, 100)
     pierced = channels.clone()
     pierced[:, :8] *= flips
-    assert figures(pierced)["handles"] > 50
-    assert figures(pierced)["manifold"] == 100
+    assert metrics(pierced)["handles"] > 50
+    assert metrics(pierced)["manifold"] == 100
 
 
 def test_a_batch_without_surfaces_is_refused(vae_task, batch):

@@ -10,19 +10,19 @@ import torch
 from datagen.config import load_config as load_datagen_config
 from datagen.objects.stores.library import StarterPack
 from datagen.objects.targets.learning_targets import TargetsConfig, learning_targets
-from model.data.batch import ObjectSurface
+from model.data.batch import SurfaceTarget
 from model.recipes.slat_config import SlatTrainingConfig, SlatVaePart, load_any_config
 from model.structured_latent.object_features.object_input import ObjectInputs
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask
 from model.training.step_generators import sample_generators
-from tests.model.structured_latent.solids import RESOLUTION, batch_of, surface_of
+from tests.model.structured_latent.watertight_shapes import RESOLUTION, batch_of, surface_of
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 STEPS, BATCH = 60, 2  # of the 1,500 x 4 that small_slat.yaml takes: more can only help
 UNSEEN = 12
 
 
-def starter_object(pack: StarterPack, uid: str, config: TargetsConfig) -> tuple[ObjectSurface, np.ndarray]:
+def starter_object(pack: StarterPack, uid: str, config: TargetsConfig) -> tuple[SurfaceTarget, np.ndarray]:
     """An object as shards describe it: surface samples, occupancy."""
     targets = learning_targets(pack.load(uid), 0, config)
     occupancy = np.zeros((RESOLUTION,) * 3, bool)
@@ -62,7 +62,7 @@ def test_surfaces_of_true_latents_are_right_to_five_millimetres(capsys):
         torch.nn.utils.clip_grad_norm_(network.parameters(), part.recipe.optimizer.clip_norm)
         optimizer.step()
     for name, some in (("trained on", training), ("unseen", objects[:UNSEEN])):
-        scores = [task.evaluate([batch_of(one)]).figures for one in some]
+        scores = [task.evaluate([batch_of(one)]).metrics for one in some]
         worst = min(score["f_5mm"] for score in scores)
         mean = {key: float(np.mean([score[key] for score in scores])) for key in scores[0]}
         with capsys.disabled():

@@ -60,7 +60,7 @@ def test_hand_position_and_weights_are_learned(image_channels: int) -> None:
     torch.testing.assert_close(condition.weights.sum(1), torch.ones(2))
     assert condition.weights.std() > 1e-3
     assert not torch.allclose(network.condition(image, hand.roll(1, 0)).contexts, condition.contexts)
-    # Nothing else tells the places of a picture apart when the hand features are equal everywhere.
+    # Nothing else tells the places of an image apart when the hand features are equal everywhere.
     even = hand[:, :, :1].expand(-1, -1, 4, -1)
     turned = network.condition(image.flip(2), even).contexts.flip(2)
     assert not torch.allclose(turned, network.condition(image, even).contexts)

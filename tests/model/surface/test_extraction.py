@@ -12,7 +12,7 @@ from model.surface.fields import SurfaceFields
 from model.surface.lattice import corner_lattice
 from model.surface.mesh import check_manifold
 from model.surface.simplification import simplify, without_small_components
-from model.surface.watertight_mesh import SolidConfig, solid_surface
+from model.surface.watertight_mesh import SurfaceExtractionConfig, extracted_surface
 from tests.model.surface.shells import ball, grid, noise_fields, shell_fields, torus, union
 
 SEALED = ExtractionConfig(seal=2)
@@ -140,10 +140,10 @@ def test_torus_and_two_components() -> None:
     assert without_small_components(mesh, 0.05)[1] == 0
 
 
-def test_a_shell_is_one_solid_and_a_cavity_stays_where_the_shell_says_so() -> None:
-    solid = check_manifold(extract_surface(shell_fields(64, ball(0.4), coarse=16), OPEN).mesh)
-    assert solid.components == 1
-    assert solid.volume == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=2e-3)
+def test_a_shell_is_one_watertight_and_a_cavity_stays_where_the_shell_says_so() -> None:
+    watertight = check_manifold(extract_surface(shell_fields(64, ball(0.4), coarse=16), OPEN).mesh)
+    assert watertight.components == 1
+    assert watertight.volume == pytest.approx(4 / 3 * np.pi * 0.4**3, rel=2e-3)
     hollow = lambda points: np.abs(ball(0.3)(points)) - 0.1  # noqa: E731
     report = check_manifold(extract_surface(shell_fields(64, hollow, coarse=16), OPEN).mesh)
     assert report.components == 2
@@ -163,7 +163,7 @@ def test_gaps_in_the_shell_are_sealed_and_counted() -> None:
     )
 
 
-def test_solids_beyond_the_cube_end_at_its_sides() -> None:
+def test_watertight_shapes_beyond_the_cube_end_at_its_sides() -> None:
     mesh = extract_surface(shell_fields(32, ball(0.7), coarse=8), SEALED).mesh
     check_manifold(mesh)
     assert np.abs(mesh.vertices).max() < 0.5 + 0.01 / 32
@@ -206,14 +206,16 @@ def test_simplification_stops_at_the_allowed_move() -> None:
     assert simplify(mesh, len(mesh.faces), max_move=1e-3) is mesh
 
 
-def test_solid_surface_of_a_bumpy_torus() -> None:
+def test_watertight_surface_of_a_bumpy_torus() -> None:
     bumpy = lambda p: torus(0.3, 0.1)(p) + 0.004 * np.sin(150 * p[..., 0]) * np.sin(150 * p[..., 1])  # noqa: E731
-    config = SolidConfig(
+    config = SurfaceExtractionConfig(
         extraction=SEALED, min_component_share=0.01, max_faces=8000, max_simplification_move=0.01
     )
-    solid = solid_surface(shell_fields(64, bumpy, coarse=16), config)
-    assert 0.8 * 8000 < solid.report.faces <= 8000
-    assert solid.report.genus == 1
-    assert solid.report.volume == pytest.approx(2 * np.pi**2 * 0.3 * 0.1**2, rel=0.02)
-    assert _watertight(solid.mesh)
-    np.testing.assert_allclose(solid.mesh.colors, 1 / (1 + np.exp(-4.0 * solid.mesh.vertices)), atol=1e-3)
+    watertight = extracted_surface(shell_fields(64, bumpy, coarse=16), config)
+    assert 0.8 * 8000 < watertight.report.faces <= 8000
+    assert watertight.report.genus == 1
+    assert watertight.report.volume == pytest.approx(2 * np.pi**2 * 0.3 * 0.1**2, rel=0.02)
+    assert _watertight(watertight.mesh)
+    np.testing.assert_allclose(
+        watertight.mesh.colors, 1 / (1 + np.exp(-4.0 * watertight.mesh.vertices)), atol=1e-3
+    )

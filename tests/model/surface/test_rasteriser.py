@@ -1,4 +1,4 @@
-"""Pictures against the formula of a sphere, against ray casting, and against themselves turned."""
+"""Images against the formula of a sphere, against ray casting, and against themselves turned."""
 
 import numpy as np
 import pytest
@@ -49,7 +49,7 @@ def test_ray_casting_sees_the_same_faces() -> None:
         )
         parts.append(box.apply_translation(rng.uniform(-0.3, 0.3, 3)))
     shape = trimesh.util.concatenate(parts)
-    picture = render_mesh(_mesh(shape), K, T_CAM_FROM_OBJ, SIZE, PLAIN)
+    image = render_mesh(_mesh(shape), K, T_CAM_FROM_OBJ, SIZE, PLAIN)
     T_obj_from_cam = invert_transform(T_CAM_FROM_OBJ)
     rays = (pixel_rays_cam(K, SIZE) @ T_obj_from_cam[:3, :3].T).reshape(-1, 3)
     origins = np.broadcast_to(T_obj_from_cam[:3, 3], rays.shape)
@@ -58,9 +58,9 @@ def test_ray_casting_sees_the_same_faces() -> None:
     cast[ray] = face
     depth = np.zeros(len(rays))
     depth[ray] = (points @ T_CAM_FROM_OBJ[:3, :3].T + T_CAM_FROM_OBJ[:3, 3])[:, 2]
-    assert picture.mask.sum() > 5000
-    assert (picture.face.reshape(-1) == cast).mean() > 0.999  # the rest on edges
-    assert (np.abs(picture.depth.reshape(-1) - depth) < 1e-4).mean() > 0.999
+    assert image.mask.sum() > 5000
+    assert (image.face.reshape(-1) == cast).mean() > 0.999  # the rest on edges
+    assert (np.abs(image.depth.reshape(-1) - depth) < 1e-4).mean() > 0.999
 
 
 def test_colours_are_interpolated_in_space_and_not_in_the_image() -> None:
@@ -134,7 +134,7 @@ def test_a_camera_inside_the_mesh_is_refused() -> None:
         render_mesh(mesh, K, np.eye(4), SIZE, PLAIN)
 
 
-def test_turntable_turns_once_and_keeps_the_mesh_in_the_picture() -> None:
+def test_turntable_turns_once_and_keeps_the_mesh_in_the_image() -> None:
     shape = trimesh.creation.box((0.9, 0.3, 0.5))
     config = TurntableConfig(
         frames=8,

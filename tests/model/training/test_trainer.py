@@ -313,8 +313,8 @@ def test_the_log_is_written_and_what_loads_the_batches_is_closed_however_a_run_e
     assert [event.step for event in log.Scalars("training/loss")] == [1, 2, 3, 4, 5]
 
 
-def test_a_figure_without_a_number_is_not_logged(tmp_path):
-    evaluation = Evaluation(figures={"known": 1.5, "nothing": math.nan, "endless": math.inf}, pictures={})
+def test_a_metric_without_a_number_is_not_logged(tmp_path):
+    evaluation = Evaluation(metrics={"known": 1.5, "nothing": math.nan, "endless": math.inf}, images={})
     run(tmp_path, settings(4, validate_every=4), validate=lambda: evaluation)
     log = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
     assert [tag for tag in log.Tags()["scalars"] if tag.startswith("validation/")] == ["validation/known"]

@@ -112,8 +112,8 @@ class ToyTask:
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         errors = [self.loss(batch, [torch.Generator() for _ in batch.ids]).total for batch in batches]
         return Evaluation(
-            figures={"error": float(torch.stack(errors).mean())},
-            pictures={"grey": np.zeros((4, 4, 3), np.uint8)},
+            metrics={"error": float(torch.stack(errors).mean())},
+            images={"grey": np.zeros((4, 4, 3), np.uint8)},
         )
 
 

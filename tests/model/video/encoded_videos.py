@@ -38,7 +38,7 @@ def numbers(frames: VideoFrames) -> list[int]:
 
 
 def corner_is_red(image: np.ndarray) -> bool:
-    """Whether the picture is the right way up."""
+    """Whether the image is the right way up."""
     height, width = image.shape[:2]
     patch = image[: height // 4, : width // 4].reshape(-1, 3).mean(axis=0)
     return bool(patch[0] > 150 and patch[1] < 90 and patch[2] < 90)

@@ -64,14 +64,14 @@ def test_a_repeated_frame_waits_until_all_others_are_chosen(
 
 
 @pytest.mark.parametrize("sigma", [1.0, 2.0, 4.0])
-@pytest.mark.parametrize("whole_picture", [True, False])
-def test_a_blurred_copy_loses_to_its_original(sigma: float, whole_picture: bool) -> None:
+@pytest.mark.parametrize("whole_image", [True, False])
+def test_a_blurred_copy_loses_to_its_original(sigma: float, whole_image: bool) -> None:
     """Motion blur of the object alone counts as much as a shaken camera."""
 
     def blurred(place: int) -> np.ndarray:
         image = scene(10 * place)
         soft = cv2.GaussianBlur(image, (0, 0), sigma)
-        if not whole_picture:
+        if not whole_image:
             x = 10 * place
             image[30:54, x : x + 24] = soft[30:54, x : x + 24]
             return image
@@ -141,7 +141,7 @@ def test_record_says_what_decided() -> None:
     assert choice.n_candidates == 6
 
 
-def test_pictures_of_mixed_sizes_can_be_compared() -> None:
+def test_images_of_mixed_sizes_can_be_compared() -> None:
     images = [scene(10), cv2.resize(scene(60), (140, 96)), scene(35)]
     assert len(choose_frames(as_frames(images), 2).positions) == 2
 

@@ -1,4 +1,4 @@
-"""Folders of pictures and single ones: upright 8-bit RGB in natural order, and a name for what is broken."""
+"""Folders of images and single ones: upright 8-bit RGB in natural order, and a name for what is broken."""
 
 from pathlib import Path
 
@@ -32,7 +32,7 @@ def test_natural_order_and_formats(tmp_path: Path) -> None:
     assert numbers(frames) == [1, 2, 9, 10, 100]
     assert [frame.name for frame in frames.frames][:2] == ["frame_1.JPEG", "frame_2.webp"]
     assert np.isnan(frames.times_s).all()
-    assert frames.notes == ("files that are no pictures were not read: 1 .txt",)
+    assert frames.notes == ("files that are no images were not read: 1 .txt",)
 
 
 def test_natural_key_never_compares_text_with_numbers() -> None:
@@ -41,7 +41,7 @@ def test_natural_key_never_compares_text_with_numbers() -> None:
     assert ordered == ["2", "10", "a", "a2", "A3", "a10b", "a10b2", "b"]
 
 
-def test_many_pictures_are_thinned_evenly_and_indices_are_exact(tmp_path: Path) -> None:
+def test_many_images_are_thinned_evenly_and_indices_are_exact(tmp_path: Path) -> None:
     for number in range(40):
         save(tmp_path / f"{number}.png", numbered_frame(number, (64, 48)))
     frames = read_frames(tmp_path, ReadLimits(max_frames=8, max_side_px=64))
@@ -123,24 +123,24 @@ def test_transparency_lies_over_black(tmp_path: Path, depth: int) -> None:
 
 
 def test_palette_with_a_transparent_colour(tmp_path: Path) -> None:
-    picture = Image.new("P", (8, 8), 1)
-    picture.putpalette([255, 255, 255, 10, 200, 30])
-    picture.paste(0, (0, 0, 4, 8))
-    picture.save(tmp_path / "p.png", transparency=0)
+    palette_image = Image.new("P", (8, 8), 1)
+    palette_image.putpalette([255, 255, 255, 10, 200, 30])
+    palette_image.paste(0, (0, 0, 4, 8))
+    palette_image.save(tmp_path / "p.png", transparency=0)
     image = read_frames(tmp_path / "p.png", ALL).images[0]
     assert image[:, :4].max() == 0
     assert tuple(image[0, 6]) == (10, 200, 30)
 
 
 def test_mixed_sizes_are_allowed(tmp_path: Path) -> None:
-    """Each picture is cropped on its own."""
+    """Each image is cropped on its own."""
     save(tmp_path / "1.png", numbered_frame(1, (160, 96)))
     save(tmp_path / "2.png", numbered_frame(2, (80, 120)))
     frames = read_frames(tmp_path, ALL)
     assert [image.shape for image in frames.images] == [(96, 160, 3), (120, 80, 3)]
 
 
-def test_single_picture_says_what_it_lacks(tmp_path: Path) -> None:
+def test_single_image_says_what_it_lacks(tmp_path: Path) -> None:
     frames = read_frames(save(tmp_path / "mug.png", numbered_frame(3)), ALL)
     assert numbers(frames) == [3]
     assert any("one frame only" in note for note in frames.notes)
@@ -148,7 +148,7 @@ def test_single_picture_says_what_it_lacks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp"])
 @pytest.mark.parametrize("share", [0.0, 0.05, 0.6])
-def test_cut_picture_is_named(tmp_path: Path, suffix: str, share: float) -> None:
+def test_cut_image_is_named(tmp_path: Path, suffix: str, share: float) -> None:
     save(tmp_path / f"1.{suffix}", numbered_frame(1))
     noise = np.random.default_rng(0).integers(0, 256, (96, 160, 3), dtype=np.uint8)
     path = save(tmp_path / f"2.{suffix}", noise)
@@ -156,20 +156,20 @@ def test_cut_picture_is_named(tmp_path: Path, suffix: str, share: float) -> None
     path.write_bytes(data[: int(share * len(data))])
     with pytest.raises(ModelError) as error:
         read_frames(tmp_path, ALL)
-    assert f"2.{suffix}: the picture cannot be read" in str(error.value)
+    assert f"2.{suffix}: the image cannot be read" in str(error.value)
     assert "\n" not in str(error.value)
 
 
-def test_text_that_is_called_a_picture(tmp_path: Path) -> None:
+def test_text_that_is_called_a_image(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_text("hello")
-    with pytest.raises(ModelError, match=r"a\.png: the picture cannot be read: not a picture"):
+    with pytest.raises(ModelError, match=r"a\.png: the image cannot be read: not an image"):
         read_frames(tmp_path, ALL)
 
 
-def test_folders_without_pictures(tmp_path: Path) -> None:
+def test_folders_without_images(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="it is empty"):
         read_frames(tmp_path, ALL)
     for name in ("a.heic", "b.heic", "c.txt"):
         (tmp_path / name).write_bytes(b"x")
-    with pytest.raises(ModelError, match=r"no pictures in this folder \(2 \.heic, 1 \.txt\)"):
+    with pytest.raises(ModelError, match=r"no images in this folder \(2 \.heic, 1 \.txt\)"):
         read_frames(tmp_path, ALL)

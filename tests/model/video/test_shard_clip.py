@@ -1,4 +1,4 @@
-"""A clip of a dataset is read like a video: its pictures, nothing of its truth unless asked for by name."""
+"""A clip of a dataset is read like a video: its images, nothing of its truth unless asked for by name."""
 
 from pathlib import Path
 
@@ -27,7 +27,7 @@ def clip_ids(dataset: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("place", ["", "/", "/shards/shard-00000", "/shards/shard-00000/"])
-def test_pictures_are_those_of_the_reader(dataset: Path, place: str) -> None:
+def test_images_are_those_of_the_reader(dataset: Path, place: str) -> None:
     clip_id = clip_ids(dataset)[1]
     frames = read_frames(f"{dataset}{place}#{clip_id}", ALL)
     truth = open_dataset(dataset).read_frames(clip_id)

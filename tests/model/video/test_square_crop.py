@@ -76,7 +76,7 @@ def test_pixels_are_those_of_training() -> None:
         np.testing.assert_array_equal(square_crop(image, box, size)[0], expected)
 
 
-def test_outside_of_the_picture_is_black() -> None:
+def test_outside_of_the_image_is_black() -> None:
     crop, window = square_crop(np.full((40, 40, 3), 255, np.uint8), np.array([-20.0, 10.0, 20.0, 50.0]), 40)
     assert window.corner_px == (-20, 10)
     assert crop[:, :, :19].max() == 0
@@ -147,7 +147,7 @@ def test_stray_pixels_do_not_widen_the_box_but_a_hand_does() -> None:
 def test_masks_come_back_onto_the_source(
     center: tuple[float, float], radius: float, source_scale: float, size: int
 ) -> None:
-    """Drawn in the source, seen in the crop of its scaled-down picture, pasted back: the same disc."""
+    """Drawn in the source, seen in the crop of its scaled-down image, pasted back: the same disc."""
     image_size = (320, 180)
     source_size = (round(320 * source_scale), round(180 * source_scale))
     frame = frame_of(np.zeros((180, 320, 3), np.uint8), source_size)
@@ -197,7 +197,7 @@ def test_boxes_from_the_command_line_are_in_source_pixels() -> None:
         assert "1920 x 1080" in str(error.value)
 
 
-def test_cropped_picture_lies_where_the_window_says() -> None:
+def test_cropped_image_lies_where_the_window_says() -> None:
     """A bright dot of the image is found in the crop where the transform puts it."""
     rng = np.random.default_rng(4)
     for _ in range(20):

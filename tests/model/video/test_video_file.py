@@ -72,7 +72,7 @@ def test_colours_survive(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("turn", [90, 180, 270])
 def test_rotation_metadata_is_respected(tmp_path: Path, turn: int) -> None:
-    """A phone stores the sensor's picture, and how far to turn it against the clock."""
+    """A phone stores the sensor's image, and how far to turn it against the clock."""
     scene = [numbered_frame(i) for i in (5, 6, 7)]
     stored = [np.ascontiguousarray(np.rot90(image, -turn // 90)) for image in scene]
     frames = read_frames(write_video(tmp_path / "r.mp4", stored, turn_deg=turn), ALL)
@@ -128,7 +128,7 @@ def test_4k_is_scaled_down_while_decoding(tmp_path: Path) -> None:
     assert {image.shape for image in frames.images} == {(360, 640, 3)}
     assert {frame.source_size for frame in frames.frames} == {big}
     assert numbers(frames) == frames.indices.tolist()
-    assert peak < 3840 * 2160 * 3  # not even one full picture in Python's memory
+    assert peak < 3840 * 2160 * 3  # not even one full image in Python's memory
     assert frames.changes == ("scaled down from 3840 x 2160 to 640 x 360 (8 of 8 frames)",)
 
 

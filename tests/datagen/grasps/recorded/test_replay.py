@@ -149,7 +149,7 @@ def test_another_hand_stands_in_and_says_so(simulated, recorded, hand, objects, 
     assert np.linalg.norm(after - before, axis=-1).max() < 0.015
 
 
-def test_a_hand_that_never_touches_is_refused_with_figures(recorded, recording_hand, objects, settings):
+def test_a_hand_that_never_touches_is_refused_with_metrics(recorded, recording_hand, objects, settings):
     far = replace(
         recorded, hand_translation_world=recorded.hand_translation_world + np.array([0.0, 0.3, 0.0])
     )
@@ -157,7 +157,7 @@ def test_a_hand_that_never_touches_is_refused_with_figures(recorded, recording_h
         replay(far, recording_hand, objects["can"], settings)
 
 
-def test_a_hand_that_sinks_in_is_refused_with_figures(recorded, recording_hand, objects, settings):
+def test_a_hand_that_sinks_in_is_refused_with_metrics(recorded, recording_hand, objects, settings):
     strict = replace(settings, max_penetration_m=0.0)
     wrist = recording_hand.joints_rest[0]
     fatter = replace(recording_hand, verts_rest=wrist + 1.05 * (recording_hand.verts_rest - wrist))

@@ -210,7 +210,7 @@ def recorded_grasp(file, hand) -> Grasp:
     )
 
 
-def figures(grasp: Grasp, hand, parameters) -> tuple[float, ...]:
+def metrics(grasp: Grasp, hand, parameters) -> tuple[float, ...]:
     """Depth while carried and before (mm), digits 3 mm deep to 5 mm off at the end and while carried,
     thumb gap (mm)."""
     distances = grasp.distances(hand, parameters, grasp.carried()) * 1e3
@@ -238,10 +238,10 @@ def measured(files, hand) -> tuple[np.ndarray, np.ndarray]:
         rows = grasp.carried()
         wrist = [posed(hand, p, rows).joints_world[:, 0] for p in (grasp.parameters, fitted)]
         shift = np.linalg.norm(wrist[0] - wrist[1], axis=1).max() * 1e3
-        before.append((*figures(grasp, hand, grasp.parameters), largest_step_deg(hand, grasp.parameters)))
+        before.append((*metrics(grasp, hand, grasp.parameters), largest_step_deg(hand, grasp.parameters)))
         after.append(
             (
-                *figures(grasp, hand, fitted),
+                *metrics(grasp, hand, fitted),
                 largest_step_deg(hand, fitted),
                 turn.mean(),
                 turn.max(),

@@ -34,8 +34,8 @@ def test_mirror_image_is_the_same_thing_seen_in_a_mirror(rock):
         face_normals(rock.mesh.verts_obj, rock.mesh.faces) * flip,
         atol=1e-12,
     )
-    for solid in (image.solid, *image.solid.parts):
-        assert trimesh.Trimesh(solid.verts_obj, solid.faces, process=False).volume > 0
+    for watertight in (image.watertight, *image.watertight.parts):
+        assert trimesh.Trimesh(watertight.verts_obj, watertight.faces, process=False).volume > 0
     face = np.arange(len(rock.mesh.faces))
     weights = np.tile([0.7, 0.2, 0.1], (len(face), 1))
     np.testing.assert_allclose(
@@ -56,9 +56,9 @@ def test_twice_mirrored_is_the_original(rock):
     assert twice.mesh.materials == rock.mesh.materials
     for name in ("verts_obj", "faces", "corner_uv", "face_material"):
         np.testing.assert_array_equal(getattr(twice.mesh, name), getattr(rock.mesh, name))
-    np.testing.assert_array_equal(twice.solid.verts_obj, rock.solid.verts_obj)
-    np.testing.assert_array_equal(twice.solid.faces, rock.solid.faces)
-    for part, original in zip(twice.solid.parts, rock.solid.parts, strict=True):
+    np.testing.assert_array_equal(twice.watertight.verts_obj, rock.watertight.verts_obj)
+    np.testing.assert_array_equal(twice.watertight.faces, rock.watertight.faces)
+    for part, original in zip(twice.watertight.parts, rock.watertight.parts, strict=True):
         np.testing.assert_array_equal(part.verts_obj, original.verts_obj)
         np.testing.assert_array_equal(part.faces, original.faces)
     np.testing.assert_array_equal(twice.T_obj_from_file, rock.T_obj_from_file)

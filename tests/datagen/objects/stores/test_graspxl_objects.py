@@ -16,7 +16,7 @@ from datagen.objects.mesh.surface_points import sample_surface
 from datagen.objects.stores.graspxl_objects import GraspXLObjects
 from datagen.objects.stores.library import REFERENCE_READING, ObjectLibrary
 from datagen.objects.stores.objaverse import ObjaverseStore
-from datagen.objects.watertight.preparation import make_solid, solid_from_bytes, solid_to_bytes
+from datagen.objects.watertight.preparation import make_watertight, watertight_from_bytes, watertight_to_bytes
 from tests.datagen.grasps.recorded.graspxl_sample import SAMPLE, needs_sample
 from tests.datagen.objects.official_files import (
     MODELS,
@@ -87,9 +87,9 @@ def test_untextured_object_stays_in_the_frame_of_the_poses(opened, root):
     assert (asset.licence, asset.source, asset.appearance) == ("CC-BY-NC-4.0", "graspxl", "generated")
     assert asset.texture.texture_resolution_px == 0
     assert asset.registration is None
-    assert asset.solid.parts == ()
-    assert asset.solid.fit is not None
-    assert np.isnan(asset.solid.fit.hull_excess_max_m)
+    assert asset.watertight.parts == ()
+    assert asset.watertight.fit is not None
+    assert np.isnan(asset.watertight.fit.hull_excess_max_m)
 
 
 def test_textured_original_is_drawn_in_place(opened, root, store_root):
@@ -241,12 +241,12 @@ def test_unknown_uid_is_named(opened, root, uid):
         opened(root).load(uid)
 
 
-def test_solid_without_parts_keeps_its_bytes(box, plain_mesh, quick_preparation):
-    solid = make_solid(plain_mesh(*box), quick_preparation, source="box", with_parts=False)
-    data = solid_to_bytes(solid)
-    again = solid_from_bytes(data)
+def test_watertight_without_parts_keeps_its_bytes(box, plain_mesh, quick_preparation):
+    watertight = make_watertight(plain_mesh(*box), quick_preparation, source="box", with_parts=False)
+    data = watertight_to_bytes(watertight)
+    again = watertight_from_bytes(data)
     assert again.parts == ()
-    assert solid_to_bytes(again) == data
+    assert watertight_to_bytes(again) == data
 
 
 def test_looks_differ_by_name_and_stay_for_one(box, plain_mesh):
@@ -264,17 +264,18 @@ def test_looks_differ_by_name_and_stay_for_one(box, plain_mesh):
 
 @needs_sample
 def test_published_sample_loads(tmp_path, quick_preparation, monkeypatch):
-    """Every real mesh, with solids (and figures of their fit) coarse enough for seconds."""
+    """Every real mesh, with watertight meshes (and metrics of their fit) coarse enough for seconds."""
     monkeypatch.setattr("datagen.objects.watertight.preparation.N_DEVIATION_POINTS", 1000)
     coarse = replace(
-        quick_preparation.solid, level_set=replace(quick_preparation.solid.level_set, voxels_longest=40)
+        quick_preparation.watertight,
+        level_set=replace(quick_preparation.watertight.level_set, voxels_longest=40),
     )
     library = GraspXLObjects(
         SAMPLE,
         None,
         textures="none",
         reading=REFERENCE_READING,
-        preparation=replace(quick_preparation, solid=coarse),
+        preparation=replace(quick_preparation, watertight=coarse),
         registration=REFERENCE_REGISTRATION,
         cache_dir=tmp_path,
     )
@@ -285,4 +286,6 @@ def test_published_sample_loads(tmp_path, quick_preparation, monkeypatch):
         assert 0.06 < sides.min() < 0.09
         np.testing.assert_allclose(asset.T_obj_from_file[:3, :3], np.eye(3))
         assert np.abs(asset.T_obj_from_file[:3, 3]).max() < 1e-4  # published meshes are centred
-        assert trimesh.Trimesh(asset.solid.verts_obj, asset.solid.faces, process=False).is_watertight
+        assert trimesh.Trimesh(
+            asset.watertight.verts_obj, asset.watertight.faces, process=False
+        ).is_watertight

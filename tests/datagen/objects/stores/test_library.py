@@ -46,21 +46,21 @@ def test_package_data_stays_small():
     assert size <= 8.5e6
 
 
-def test_solids_are_closed_and_follow_what_is_drawn(assets):
+def test_watertight_shapes_are_closed_and_follow_what_is_drawn(assets):
     for asset in assets:
-        solid = trimesh.Trimesh(asset.solid.verts_obj, asset.solid.faces, process=False)
-        assert solid.is_watertight, asset.uid
-        assert solid.volume > 0, asset.uid
-        assert asset.solid.fit is not None
-        assert asset.solid.fit.deviation_mean_m < 1.5e-3, asset.uid
+        watertight = trimesh.Trimesh(asset.watertight.verts_obj, asset.watertight.faces, process=False)
+        assert watertight.is_watertight, asset.uid
+        assert watertight.volume > 0, asset.uid
+        assert asset.watertight.fit is not None
+        assert asset.watertight.fit.deviation_mean_m < 1.5e-3, asset.uid
         extent = np.ptp(asset.mesh.verts_obj, axis=0)
-        np.testing.assert_allclose(solid.extents, extent, atol=2.5e-3, err_msg=asset.uid)
+        np.testing.assert_allclose(watertight.extents, extent, atol=2.5e-3, err_msg=asset.uid)
 
 
 def test_convex_parts_are_sound(assets):
     for asset in assets:
-        assert 1 <= len(asset.solid.parts) <= 64, asset.uid
-        for part in asset.solid.parts:
+        assert 1 <= len(asset.watertight.parts) <= 64, asset.uid
+        for part in asset.watertight.parts:
             assert trimesh.Trimesh(part.verts_obj, part.faces, process=False).volume > 0, asset.uid
 
 
@@ -97,7 +97,7 @@ def test_description_and_texture_agree_with_the_loaded_object(pack, assets):
 def test_loading_is_deterministic(pack):
     first, second = pack.load("starter/milk"), StarterPack().load("starter/milk")
     np.testing.assert_array_equal(first.mesh.verts_obj, second.mesh.verts_obj)
-    np.testing.assert_array_equal(first.solid.verts_obj, second.solid.verts_obj)
+    np.testing.assert_array_equal(first.watertight.verts_obj, second.watertight.verts_obj)
     assert first.mesh.materials == second.mesh.materials
 
 
@@ -128,7 +128,7 @@ def test_folder_loads_notes_and_caches(tmp_path, quick_preparation):
     assert library.texture_quality("folder/deep/box.stl") == first.texture
     np.testing.assert_allclose(np.ptp(first.mesh.verts_obj, axis=0), [0.10, 0.06, 0.08])
     again = library.load("folder/deep/box.stl")
-    np.testing.assert_array_equal(first.solid.verts_obj, again.solid.verts_obj)
+    np.testing.assert_array_equal(first.watertight.verts_obj, again.watertight.verts_obj)
     assert len(list(cache.iterdir())) == 1
 
 
@@ -179,8 +179,8 @@ def test_graspxl_meshes_load_as_a_folder(tmp_path, quick_preparation):
     assert len(library.uids()) == 20
     for uid in library.uids()[::5]:
         asset = library.load(uid)
-        solid = trimesh.Trimesh(asset.solid.verts_obj, asset.solid.faces, process=False)
-        assert solid.is_watertight
+        watertight = trimesh.Trimesh(asset.watertight.verts_obj, asset.watertight.faces, process=False)
+        assert watertight.is_watertight
         assert 0.06 < np.ptp(asset.mesh.verts_obj, axis=0).min() < 0.09
 
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from datagen.objects.asset.object_asset import ObjectAsset, Solid
+from datagen.objects.asset.object_asset import ObjectAsset, WatertightMesh
 from datagen.objects.mesh.texture_quality import TextureQuality
 from datagen.objects.targets.learning_targets import LearningTargets, TargetsConfig, learning_targets
 from datagen.objects.targets.occupancy import surface_voxels
-from datagen.objects.watertight.watertight_mesh import closed_surface, signed_distance
+from datagen.objects.watertight.watertight_mesh import signed_distance, watertight_surface
 
 CONFIG = TargetsConfig(
     surface_points=2048, sdf_near_points=1024, sdf_near_sigma=0.02, sdf_uniform_points=1024
@@ -24,7 +24,7 @@ def make_asset(mesh, surface) -> ObjectAsset:
         author="nobody",
         url="",
         mesh=mesh,
-        solid=Solid(
+        watertight=WatertightMesh(
             verts_obj=surface.verts_obj,
             faces=surface.faces,
             parts=(),
@@ -36,8 +36,8 @@ def make_asset(mesh, surface) -> ObjectAsset:
 
 
 @pytest.fixture
-def box_targets(box, plain_mesh, solid_config) -> LearningTargets:
-    asset = make_asset(plain_mesh(*box), closed_surface(*box, solid_config, source="box"))
+def box_targets(box, plain_mesh, watertight_config) -> LearningTargets:
+    asset = make_asset(plain_mesh(*box), watertight_surface(*box, watertight_config, source="box"))
     return learning_targets(asset, 7, CONFIG)
 
 
@@ -61,9 +61,9 @@ def test_occupancy_is_the_surface_and_not_the_inside(box_targets):
     index = np.stack(np.meshgrid(*[np.arange(64)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     low, high = index / 64 - 0.5, (index + 1) / 64 - 0.5
     clipped = np.minimum(HALF, 0.5 - 1e-6)
-    touches_solid = ((low <= clipped) & (high >= -clipped)).all(axis=1)
+    touches_watertight = ((low <= clipped) & (high >= -clipped)).all(axis=1)
     strictly_inside = ((low > -clipped) & (high < clipped)).all(axis=1)
-    np.testing.assert_array_equal(box_targets.occupancy_64, index[touches_solid & ~strictly_inside])
+    np.testing.assert_array_equal(box_targets.occupancy_64, index[touches_watertight & ~strictly_inside])
 
 
 def test_occupancy_holds_every_voxel_a_sphere_passes():
@@ -95,8 +95,8 @@ def test_metres_come_back(box_targets, box):
     np.testing.assert_allclose(np.abs(points_m).max(axis=0), [0.05, 0.04, 0.03], atol=1e-6)
 
 
-def test_same_seed_same_bytes_and_other_seed_other_points(box, plain_mesh, solid_config, box_targets):
-    asset = make_asset(plain_mesh(*box), closed_surface(*box, solid_config, source="box"))
+def test_same_seed_same_bytes_and_other_seed_other_points(box, plain_mesh, watertight_config, box_targets):
+    asset = make_asset(plain_mesh(*box), watertight_surface(*box, watertight_config, source="box"))
     again = learning_targets(asset, 7, CONFIG)
     other = learning_targets(asset, 8, CONFIG)
     for name in ("occupancy_64", "surface_points", "surface_colors", "sdf_points", "sdf_values"):
@@ -105,10 +105,10 @@ def test_same_seed_same_bytes_and_other_seed_other_points(box, plain_mesh, solid
 
 
 @pytest.mark.parametrize("shape", ["open_box", "sheet_cup", "crossing_boxes"])
-def test_distance_field_of_awkward_meshes(shape, request, plain_mesh, solid_config):
+def test_distance_field_of_awkward_meshes(shape, request, plain_mesh, watertight_config):
     """Gradient norm 1 almost everywhere, sign as an eye would say, values as far as the surface."""
     verts, faces = request.getfixturevalue(shape)
-    surface = closed_surface(verts, faces, solid_config, source=shape)
+    surface = watertight_surface(verts, faces, watertight_config, source=shape)
     targets = learning_targets(make_asset(plain_mesh(verts, faces), surface), 0, CONFIG)
     points = targets.sdf_points.astype(np.float64)
     canonical = surface.verts_obj / targets.object_scale_m
@@ -129,8 +129,8 @@ def test_distance_field_of_awkward_meshes(shape, request, plain_mesh, solid_conf
     assert np.abs(targets.surface_points).max() < 0.52
 
 
-def test_crossing_boxes_have_the_sign_of_their_union(crossing_boxes, plain_mesh, solid_config):
-    surface = closed_surface(*crossing_boxes, solid_config, source="boxes")
+def test_crossing_boxes_have_the_sign_of_their_union(crossing_boxes, plain_mesh, watertight_config):
+    surface = watertight_surface(*crossing_boxes, watertight_config, source="boxes")
     asset = make_asset(plain_mesh(*crossing_boxes), surface)
     targets = learning_targets(asset, 0, CONFIG)
     points_m = np.abs(targets.sdf_points * targets.object_scale_m)

@@ -1,4 +1,4 @@
-"""Convex parts: they cover the solid, and their excess is what is recorded."""
+"""Convex parts: they cover the watertight mesh, and their excess is what is recorded."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,12 @@ import trimesh
 from datagen.objects.watertight.convex_parts import ConvexConfig, convex_parts
 from datagen.objects.watertight.preparation import (
     PreparationConfig,
-    cached_solid,
-    make_solid,
-    solid_from_bytes,
-    solid_to_bytes,
+    cached_watertight,
+    make_watertight,
+    watertight_from_bytes,
+    watertight_to_bytes,
 )
-from datagen.objects.watertight.watertight_mesh import ClosedSurface, closed_surface, signed_distance
+from datagen.objects.watertight.watertight_mesh import WatertightSurface, signed_distance, watertight_surface
 
 CONFIG = ConvexConfig(
     thresholds=(0.05,),
@@ -26,8 +26,8 @@ CONFIG = ConvexConfig(
 )
 
 
-def surface_of(verts, faces) -> ClosedSurface:
-    return ClosedSurface(verts_obj=np.array(verts), faces=np.array(faces), watertight_source=True)
+def surface_of(verts, faces) -> WatertightSurface:
+    return WatertightSurface(verts_obj=np.array(verts), faces=np.array(faces), watertight_source=True)
 
 
 def test_a_box_is_its_own_hull(box):
@@ -47,8 +47,8 @@ def test_round_hulls_keep_within_a_millimetre():
     assert fit.excess_max_m < 5e-4
 
 
-def test_parts_of_a_cross_are_closed_convex_and_cover_it(crossing_boxes, solid_config):
-    surface = closed_surface(*crossing_boxes, solid_config, source="cross")
+def test_parts_of_a_cross_are_closed_convex_and_cover_it(crossing_boxes, watertight_config):
+    surface = watertight_surface(*crossing_boxes, watertight_config, source="cross")
     parts, fit = convex_parts(surface, CONFIG)
     assert len(parts) > 1
     for part in parts:
@@ -66,8 +66,8 @@ def test_parts_of_a_cross_are_closed_convex_and_cover_it(crossing_boxes, solid_c
     assert fit.excess_max_m < 4e-3
 
 
-def test_same_solid_same_parts(crossing_boxes, solid_config):
-    surface = closed_surface(*crossing_boxes, solid_config, source="cross")
+def test_same_watertight_same_parts(crossing_boxes, watertight_config):
+    surface = watertight_surface(*crossing_boxes, watertight_config, source="cross")
     first, second = convex_parts(surface, CONFIG)[0], convex_parts(surface, CONFIG)[0]
     assert len(first) == len(second)
     for a, b in zip(first, second):
@@ -75,30 +75,30 @@ def test_same_solid_same_parts(crossing_boxes, solid_config):
 
 
 @pytest.fixture
-def preparation(solid_config) -> PreparationConfig:
-    return PreparationConfig(solid=solid_config, convex=CONFIG)
+def preparation(watertight_config) -> PreparationConfig:
+    return PreparationConfig(watertight=watertight_config, convex=CONFIG)
 
 
-def test_solid_survives_its_bytes(open_box, plain_mesh, preparation):
-    solid = make_solid(plain_mesh(*open_box), preparation, source="open box")
-    data = solid_to_bytes(solid)
-    back = solid_from_bytes(data)
-    assert solid_to_bytes(back) == data
-    np.testing.assert_allclose(back.verts_obj, solid.verts_obj, atol=1e-8)
-    assert back.fit == solid.fit
+def test_watertight_survives_its_bytes(open_box, plain_mesh, preparation):
+    watertight = make_watertight(plain_mesh(*open_box), preparation, source="open box")
+    data = watertight_to_bytes(watertight)
+    back = watertight_from_bytes(data)
+    assert watertight_to_bytes(back) == data
+    np.testing.assert_allclose(back.verts_obj, watertight.verts_obj, atol=1e-8)
+    assert back.fit == watertight.fit
     assert back.fit.deviation_max_m < 2.5e-3
-    assert len(back.parts) == len(solid.parts) >= 5
+    assert len(back.parts) == len(watertight.parts) >= 5
 
 
 def test_cache_gives_the_same_and_mends_itself(box, plain_mesh, preparation, tmp_path):
-    first = cached_solid(plain_mesh(*box), preparation, tmp_path, source="box")
+    first = cached_watertight(plain_mesh(*box), preparation, tmp_path, source="box")
     (entry,) = tmp_path.iterdir()
-    again = cached_solid(plain_mesh(*box), preparation, tmp_path, source="box")
+    again = cached_watertight(plain_mesh(*box), preparation, tmp_path, source="box")
     np.testing.assert_array_equal(first.verts_obj, again.verts_obj)
     data = entry.read_bytes()
     entry.write_bytes(data[: len(data) // 2])
-    mended = cached_solid(plain_mesh(*box), preparation, tmp_path, source="box")
+    mended = cached_watertight(plain_mesh(*box), preparation, tmp_path, source="box")
     np.testing.assert_array_equal(first.verts_obj, mended.verts_obj)
     assert entry.read_bytes() == data
-    cached_solid(plain_mesh(box[0] * 2, box[1]), preparation, tmp_path, source="larger box")
+    cached_watertight(plain_mesh(box[0] * 2, box[1]), preparation, tmp_path, source="larger box")
     assert len(list(tmp_path.iterdir())) == 2

@@ -1,4 +1,4 @@
-"""Pictures of clean objects: their colours, cameras and mirror images against a ball in closed form."""
+"""Images of clean objects: their colours, cameras and mirror images against a ball in closed form."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ def as_glb(shape: trimesh.Trimesh | trimesh.Scene) -> bytes:
     return bytes(shape.export(file_type="glb"))
 
 
-def expected_picture(view: ObjectView, *, mirror: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def expected_image(view: ObjectView, *, mirror: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
     """sRGB 0..1 of the ball of radius 1/2 by intersecting rays, and where it is hit well inside."""
     center = camera_center(view.T_cam_from_canonical)
     rays = pixel_rays_cam(view.K, (SIZE, SIZE)) @ view.T_cam_from_canonical[:3, :3]
@@ -55,12 +55,12 @@ def expected_picture(view: ObjectView, *, mirror: float = 1.0) -> tuple[np.ndarr
     return srgb_from_linear((REFLECTANCE + (1 - REFLECTANCE) * texture) * light[..., None]), root > 0.02
 
 
-def test_pictures_are_those_of_the_ball() -> None:
+def test_images_are_those_of_the_ball() -> None:
     mesh = textured_mesh(ball_glb(), T_OBJ_FROM_CANONICAL, where="ball")
     np.testing.assert_allclose(np.linalg.norm(mesh.vertices, axis=1), 0.5, atol=1e-5)
     for view in object_views(mesh, 5, SIZE, 2):
         for shown, mirror in ((view, 1.0), (view.mirrored(), -1.0)):
-            expected, inside = expected_picture(shown, mirror=mirror)
+            expected, inside = expected_image(shown, mirror=mirror)
             difference = np.abs(shown.image / 255 - expected)[inside]
             assert inside.sum() > 2000
             assert difference.max() < 0.03

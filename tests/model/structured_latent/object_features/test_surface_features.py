@@ -20,7 +20,7 @@ from model.structured_latent.object_features.surface_features import (
     projected_features,
 )
 from model.surface.fields import CORNERS
-from tests.model.structured_latent.solids import ball, ball_distance, plate, plate_distance, shell
+from tests.model.structured_latent.watertight_shapes import ball, ball_distance, plate, plate_distance, shell
 
 RESOLUTION = 64
 HALF = (0.4, 0.3, 0.015)  # a plate two voxels thick
@@ -37,7 +37,7 @@ def lattice(voxels: np.ndarray) -> np.ndarray:
         (plate(HALF), plate_distance(np.array(HALF)), 0.03, 0.01),
     ],
 )
-def test_corner_distances_are_those_of_the_solid(surface, distance, mean_voxels, wrong_sides):
+def test_corner_distances_are_those_of_the_watertight(surface, distance, mean_voxels, wrong_sides):
     voxels = np.argwhere(shell(distance))
     features = object_features(surface, voxels, RESOLUTION)
     true = distance(lattice(voxels)) * RESOLUTION
@@ -90,7 +90,7 @@ def test_the_mirrored_object_has_the_mirrored_distances(seed):
     np.testing.assert_array_equal(again.sdf_points, surface.sdf_points)
 
 
-class PictureItself:
+class ImageItself:
     """An encoder whose tokens are the pixels."""
 
     channels = 3
@@ -98,7 +98,7 @@ class PictureItself:
     def __init__(self, grid: int) -> None:
         self.grid = grid
 
-    def to(self, device, dtype) -> "PictureItself":
+    def to(self, device, dtype) -> "ImageItself":
         return self
 
     def __call__(
@@ -114,7 +114,7 @@ def view(image: np.ndarray, T_cam_from_canonical: np.ndarray) -> ObjectView:
 
 
 def test_projected_features_are_what_is_at_the_projections():
-    """Pictures that show their own pixel coordinates: the features are the mean projection of the voxel."""
+    """Images that show their own pixel coordinates: the features are the mean projection of the voxel."""
     size, rng = 48, np.random.default_rng(0)
     voxels = rng.integers(0, 64, (50, 3))
     column, row = np.meshgrid(np.arange(size), np.arange(size))
@@ -124,7 +124,7 @@ def test_projected_features_are_what_is_at_the_projections():
     T[1, :3, :3] = 0.5 * np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     T[1, :3, 3] = [0.1, 0, 2]
     views = [view(image, t) for t in T]
-    found = projected_features(iter(views), torch.from_numpy(voxels), 64, PictureItself(size))
+    found = projected_features(iter(views), torch.from_numpy(voxels), 64, ImageItself(size))
     centers = (voxels + 0.5) / 64 - 0.5
     expected = np.zeros((50, 2))
     for shown in views:
@@ -135,12 +135,12 @@ def test_projected_features_are_what_is_at_the_projections():
     assert (found.views == 2).all()
 
 
-def test_a_voxel_behind_the_camera_or_beside_the_picture_is_seen_by_no_view():
+def test_a_voxel_behind_the_camera_or_beside_the_image_is_seen_by_no_view():
     T = np.eye(4)
     T[2, 3] = 0.1  # the camera is inside the cube
     voxels = torch.tensor([[32, 32, 0], [32, 32, 63], [63, 32, 32]])
     white = np.full((48, 48, 3), 255, np.uint8)
-    found = projected_features([view(white, T)], voxels, 64, PictureItself(48))
+    found = projected_features([view(white, T)], voxels, 64, ImageItself(48))
     assert found.views.tolist() == [0, 1, 0]
     assert (found.features[0] == 0).all()
     assert (found.features[1] == 1).all()
@@ -150,6 +150,6 @@ def test_more_views_than_are_encoded_at_once_are_all_counted():
     T = np.eye(4)
     T[2, 3] = 2.0
     views = [view(np.full((48, 48, 3), value, np.uint8), T) for value in range(0, 190, 10)]
-    found = projected_features(views, torch.tensor([[32, 32, 32]]), 64, PictureItself(48))
+    found = projected_features(views, torch.tensor([[32, 32, 32]]), 64, ImageItself(48))
     assert found.views.tolist() == [19]
     torch.testing.assert_close(found.features, torch.full((1, 3), 90 / 255))

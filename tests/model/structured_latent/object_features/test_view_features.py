@@ -24,7 +24,7 @@ from shards.schema import ObjectRow
 from tests.model.data.balls import uid_of_split
 from tests.model.encoders.mean_color import MeanColor
 from tests.model.structured_latent.object_features.textured_ball import write_textured_balls
-from tests.model.structured_latent.solids import batch_of, surface_of
+from tests.model.structured_latent.watertight_shapes import batch_of, surface_of
 
 UID = uid_of_split("train", 0)
 CPU = torch.device("cpu")
@@ -88,7 +88,7 @@ def test_without_a_folder_memory_keeps_them(data, encoder, occupancy) -> None:
         features(data[False], encoder, None).rows(UID, occupancy, is_mirrored=False)
 
 
-def test_the_mirrored_object_has_the_features_of_its_mirrored_pictures(data, occupancy) -> None:
+def test_the_mirrored_object_has_the_features_of_its_mirrored_images(data, occupancy) -> None:
     """With an encoder that gives colours, a voxel of the mirrored object has those of its mirror image."""
     colors = ViewEncoder(encoder=MeanColor(4), digest="colours")
     made = features(data[True], colors, None)

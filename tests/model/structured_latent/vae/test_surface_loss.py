@@ -12,7 +12,7 @@ from model.structured_latent.object_features.surface_features import object_feat
 from model.structured_latent.vae.latent import SlatDistribution
 from model.structured_latent.vae.surface_loss import SurfaceLoss, SurfaceLossConfig, surface_loss
 from model.surface.fields import CHANNELS, CORNERS
-from tests.model.structured_latent.solids import ball, ball_distance, shell
+from tests.model.structured_latent.watertight_shapes import ball, ball_distance, shell
 
 RESOLUTION = 64
 CONFIG = SurfaceLossConfig(

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 
 from datagen.objects.targets.learning_targets import LearningTargets
-from model.data.batch import Batch, ObjectSurface, join_surfaces
+from model.data.batch import Batch, SurfaceTarget, join_surfaces
 from shards.schema import ObjectRow
 
 RESOLUTION = 64
@@ -29,13 +29,13 @@ def plate_distance(half: np.ndarray) -> Distance:
 
 def _surface(
     points: np.ndarray, normals: np.ndarray, distance: Distance, rng: np.random.Generator
-) -> ObjectSurface:
+) -> SurfaceTarget:
     near = (
         points[: len(points) // 2]
         + 0.02 * rng.standard_normal((len(points) // 2, 1)) * normals[: len(points) // 2]
     )
     sdf_points = np.concatenate([near, rng.uniform(-0.5, 0.5, (len(points) // 4, 3))])
-    return ObjectSurface(
+    return SurfaceTarget(
         points=points.astype(np.float32),
         normals=normals.astype(np.float32),
         colors=np.round(255 * (points + 0.5)).astype(np.uint8),  # so that colour tells the place
@@ -45,14 +45,14 @@ def _surface(
     )
 
 
-def ball(count: int = 6000, radius: float = 0.3, seed: int = 0) -> ObjectSurface:
+def ball(count: int = 6000, radius: float = 0.3, seed: int = 0) -> SurfaceTarget:
     rng = np.random.default_rng(seed)
     normals = rng.standard_normal((count, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     return _surface(radius * normals, normals, ball_distance(radius), rng)
 
 
-def plate(half: tuple[float, float, float], count: int = 8000, seed: int = 0) -> ObjectSurface:
+def plate(half: tuple[float, float, float], count: int = 8000, seed: int = 0) -> SurfaceTarget:
     """A box; points even over its faces."""
     rng, size = np.random.default_rng(seed), np.array(half)
     areas = np.array([size[1] * size[2], size[0] * size[2], size[0] * size[1]])
@@ -77,9 +77,9 @@ def shell(distance: Distance, resolution: int = RESOLUTION) -> np.ndarray:
     return np.any(corners, axis=0) & ~np.all(corners, axis=0)
 
 
-def surface_of(row: ObjectRow | LearningTargets) -> ObjectSurface:
+def surface_of(row: ObjectRow | LearningTargets) -> SurfaceTarget:
     """The samples of an object, as they are stored or as the generator makes them."""
-    return ObjectSurface(
+    return SurfaceTarget(
         points=row.surface_points,
         normals=row.surface_normals,
         colors=row.surface_colors,
@@ -89,8 +89,8 @@ def surface_of(row: ObjectRow | LearningTargets) -> ObjectSurface:
     )
 
 
-def batch_of(*objects: tuple[ObjectSurface, np.ndarray], views: int = 2, size: int = 32) -> Batch:
-    """Objects with grey noise for pictures."""
+def batch_of(*objects: tuple[SurfaceTarget, np.ndarray], views: int = 2, size: int = 32) -> Batch:
+    """Objects with grey noise for images."""
     import torch
 
     n = len(objects)
