@@ -4,11 +4,11 @@ Everything is verified on the way: each JSON record by its own hash, each Parque
 hash and each column chunk by the CRC in shard.json. Damage raises a ShardError, never wrong data.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import fsspec
 import numpy as np
@@ -29,6 +29,8 @@ from shards.storage.images import Geometry, Masks, decode_geometry, decode_masks
 from shards.storage.parquet import COPY_AGAIN, ParquetSource
 
 __all__ = ["ColumnTable", "Dataset", "Frame", "Frames", "Shard", "open_dataset", "open_shard"]
+
+_Image = TypeVar("_Image")  # RGB, masks or geometry of one frame
 
 
 class ColumnTable:
@@ -93,7 +95,7 @@ class Frames(ColumnTable):
         (row,) = rows_from_table(self.arrow.slice(index, 1), FrameRow, where=self.where)
         return Frame(row=row, rgb=self.rgb(index), masks=self.masks(index), geometry=self.geometry(index))
 
-    def _decoded(self, column: str, index: int, decode: Any) -> Any:
+    def _decoded(self, column: str, index: int, decode: Callable[[bytes], _Image]) -> _Image:
         if column not in self.arrow.column_names:
             self[column]  # raises
         try:
@@ -231,7 +233,7 @@ def _shard(fs: fsspec.AbstractFileSystem, path: str) -> Shard:
 
 def _read(fs: fsspec.AbstractFileSystem, path: str) -> bytes:
     try:
-        return fs.cat_file(path)
+        return bytes(fs.cat_file(path))
     except (FileNotFoundError, NotADirectoryError) as error:
         fix = "check the address; a shard without its shard.json is unfinished"
         raise DatasetNotFoundError("no such file", where=path, fix=fix) from error

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 import pytest
 
@@ -15,7 +16,7 @@ def python(code: str) -> list[str]:
 
 
 def test_events_arrive_and_other_output_goes_to_the_log(tmp_path):
-    events = []
+    events: list[dict[str, Any]] = []
     code = (
         "from datagen.child import emit; print('chatter'); emit(phase='render', done=1); emit(phase='done')"
     )

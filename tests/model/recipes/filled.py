@@ -27,6 +27,7 @@ class Filled:
     def __init__(self) -> None:
         self.module = nn.Linear(1, 1)
         nn.init.zeros_(self.module.bias)
+        self.measured: list[str] = []
 
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
         return Losses(total=(self.module.bias - _share(batch)).square().mean(), parts={})
@@ -35,7 +36,8 @@ class Filled:
         return self.measure(batches).evaluation()
 
     def measure(self, batches: Iterable[Batch]) -> Measurements:
-        errors, self.measured = [], []
+        errors: list[float] = []
+        self.measured.clear()
         for batch in batches:
             self.measured += batch.ids
             errors += (self.module.bias - _share(batch)).abs().tolist()

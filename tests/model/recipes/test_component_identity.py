@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -11,14 +12,14 @@ from model.recipes.slat_components import SLAT_PARTS, slat_part_sha256
 from model.recipes.slat_config import SlatTrainingConfig, load_any_config
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "model"
-LOADING = {"workers": 3, "prefetch_batches": 9, "cache_mb": 1, "max_corrupt": 7}
+LOADING: dict[str, Any] = {"workers": 3, "prefetch_batches": 9, "cache_mb": 1, "max_corrupt": 7}
 
 
 def tiny() -> TrainingConfig:
     return load_config(CONFIGS / "tiny.yaml")
 
 
-def with_trainer(config: TrainingConfig, **changes: int) -> TrainingConfig:
+def with_trainer(config: TrainingConfig, **changes: Any) -> TrainingConfig:
     recipe = config.stage_one.recipe
     changed = replace(recipe, trainer=replace(recipe.trainer, **changes))
     return replace(config, stage_one=replace(config.stage_one, recipe=changed))
@@ -40,7 +41,7 @@ def test_where_the_data_lie_does_not_decide():
 
 
 @pytest.mark.parametrize("change", [{"seed": 1}, {"held_out_cameras": 0.5}, {"split": "val"}])
-def test_what_is_drawn_from_the_data_decides(change):
+def test_what_is_drawn_from_the_data_decides(change: dict[str, Any]):
     config = tiny()
     other = replace(config, data=replace(config.data, **change))
     assert part_sha256("vae", other) != part_sha256("vae", config)

@@ -13,7 +13,7 @@ from model.data.stream import ShardStream
 from model.recipes.components import load_stage_one, train_part, trained_parts
 from model.recipes.config import TrainingConfig, parse_config
 from shards.geometry import intrinsics_from_fov
-from shards.schema import FrameRow
+from shards.schema import ClipRow, FrameRow
 from shards.storage.images import MASK_BITS, decode_masks, encode_masks, encode_rgb_png, mask_box_px
 from shards.writer import begin_dataset, commit_shard, stage_motion
 from tests.model.data.balls import uid_of_split
@@ -47,7 +47,8 @@ def write_motion(root: Path) -> Path:
         T = frame.T_cam_from_world @ frame.T_world_from_obj @ T_objmesh_from_canonical
         return _with_object(frame, render_mask(occupancy, T, K, (SIZE_PX, SIZE_PX)))
 
-    clips, frames = [], []
+    clips: list[ClipRow] = []
+    frames: list[FrameRow] = []
     for camera in range(CAMERAS):
         clip, clip_frames = synthetic_clip(object_row, 0, camera, FRAMES, SIZE_PX)
         clips.append(clip)

@@ -58,7 +58,9 @@ def config(dataset) -> SlatTrainingConfig:
         recipe = settings[part]["recipe"]
         recipe |= {"batch_size": 1, "views": [1, 2], "image_size": 32}
         recipe["trainer"] |= {"steps": 2, "checkpoint_every": 1, "validate_every": 2, "log_every": 1}
-    return parse_any_config(yaml.safe_dump(settings), where="small")
+    parsed = parse_any_config(yaml.safe_dump(settings), where="small")
+    assert isinstance(parsed, SlatTrainingConfig)
+    return parsed
 
 
 def train(name: str, config: SlatTrainingConfig, folder: Path) -> tuple[dict[str, float], list[int]]:
@@ -163,8 +165,10 @@ def test_the_vae_of_another_configuration_is_refused(config, finished):
 
 def test_the_hand_encoder_of_stage_one_is_refused(config, finished):
     text = as_yaml(config).replace("packaged_grid", "own_grid")
+    other = parse_any_config(text, where="own")
+    assert isinstance(other, SlatTrainingConfig)
     with pytest.raises(ModelError, match="packaged_grid"):
-        load_slat_flow(parse_any_config(text, where="own"), finished, torch.device("cpu"))
+        load_slat_flow(other, finished, torch.device("cpu"))
 
 
 @pytest.mark.parametrize("name", NAMES)

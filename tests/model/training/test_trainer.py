@@ -51,9 +51,15 @@ def run(
     return task, state, source
 
 
-def tensors(folder: Path) -> dict[str, torch.Tensor]:
+def newest(folder: Path) -> Path:
+    """The newest checkpoint of a run; there has to be one."""
     path = latest_checkpoint(folder / "checkpoints")
     assert path is not None
+    return path
+
+
+def tensors(folder: Path) -> dict[str, torch.Tensor]:
+    path = newest(folder)
     return {
         f"{file.stem}/{name}": value
         for file in sorted(path.glob("*.safetensors"))
@@ -61,11 +67,11 @@ def tensors(folder: Path) -> dict[str, torch.Tensor]:
     }
 
 
-def assert_same_tensors(a: Path, b: Path, **tolerance: float) -> None:
+def assert_same_tensors(a: Path, b: Path, *, rtol: float = 0.0, atol: float = 0.0) -> None:
     left, right = tensors(a), tensors(b)
     assert left.keys() == right.keys()
     for name in left:
-        torch.testing.assert_close(left[name], right[name], **{"rtol": 0.0, "atol": 0.0, **tolerance})
+        torch.testing.assert_close(left[name], right[name], rtol=rtol, atol=atol)
 
 
 @pytest.mark.parametrize("steps", [(4, 10), (7, 10), (1, 10)])
@@ -92,10 +98,10 @@ def test_k_steps_and_a_resume_equal_a_run_in_one_go_bit_for_bit(tmp_path, steps)
 
 def test_a_finished_run_is_left_alone(tmp_path):
     run(tmp_path, settings(5))
-    before = latest_checkpoint(tmp_path / "checkpoints").stat().st_mtime_ns
+    before = newest(tmp_path).stat().st_mtime_ns
     _, state, source = run(tmp_path, settings(5))
     assert (state.step, source.seen) == (5, [])
-    assert latest_checkpoint(tmp_path / "checkpoints").stat().st_mtime_ns == before
+    assert newest(tmp_path).stat().st_mtime_ns == before
 
 
 def test_the_loss_falls(tmp_path):
@@ -116,7 +122,7 @@ def test_two_half_batches_accumulated_equal_one_batch(tmp_path):
     whole: list[float] = []
     run(tmp_path / "b", settings(6), source=ToySource(4), report=lambda r: whole.append(r.gradient_norm))
     assert grads == pytest.approx(whole, rel=0.5)
-    assert read_state(latest_checkpoint(tmp_path / "a" / "checkpoints")).samples_consumed == 12
+    assert read_state(newest(tmp_path / "a")).samples_consumed == 12
 
 
 def torchrun(folder: Path, ranks: int, steps: int) -> None:
@@ -153,7 +159,7 @@ def test_sigterm_saves_and_the_next_run_goes_on(tmp_path):
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert "TrainingStopped" in errors
-    stopped = read_state(latest_checkpoint(tmp_path / "killed" / "checkpoints"))
+    stopped = read_state(newest(tmp_path / "killed"))
     assert 6 <= stopped.step < 12
     run(tmp_path / "killed", settings(40))
     run(tmp_path / "whole", settings(40))
@@ -163,7 +169,7 @@ def test_sigterm_saves_and_the_next_run_goes_on(tmp_path):
 def test_nan_stops_with_the_samples_named_and_the_last_good_state_kept(tmp_path):
     with pytest.raises(NonFiniteLossError, match=r"the loss is nan .*samples .*toy:2:29.*newest checkpoint"):
         run(tmp_path, settings(20), source=ToySource(4, poison=29))
-    state = read_state(latest_checkpoint(tmp_path / "checkpoints"))
+    state = read_state(newest(tmp_path))
     assert state.step == 4
     assert all(torch.isfinite(value).all() for value in tensors(tmp_path).values())
 
@@ -193,7 +199,7 @@ def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_p
             config_yaml="toy",
             config_sha256="toy",
         )
-    assert read_state(latest_checkpoint(tmp_path / "checkpoints")).step == 4
+    assert read_state(newest(tmp_path)).step == 4
     assert all(torch.isfinite(value).all() for value in tensors(tmp_path).values())
 
 
@@ -221,7 +227,7 @@ def test_validation_uses_the_averaged_weights_and_takes_them_back(tmp_path):
     for name, parameter in task.module.named_parameters():
         torch.testing.assert_close(parameter.detach(), saved[f"weights/{name}"], rtol=0.0, atol=0.0)
     other = ToyTask()
-    load_average(latest_checkpoint(tmp_path / "checkpoints"), other.module)
+    load_average(newest(tmp_path), other.module)
     for name, parameter in other.module.named_parameters():
         torch.testing.assert_close(parameter.detach(), saved[f"average/{name}"])
 
@@ -240,7 +246,7 @@ def test_other_data_are_refused_and_a_run_that_goes_on_keeps_the_configuration_o
     ):
         run(tmp_path, settings(8), source=ToySource(4, data_sha256="greys"))
     run(tmp_path, settings(8), yaml="after")
-    state = read_state(latest_checkpoint(tmp_path / "checkpoints"))
+    state = read_state(newest(tmp_path))
     assert (state.step, state.config_yaml, state.data_sha256) == (8, "after", "colours")
 
 
@@ -259,7 +265,7 @@ def test_other_data_are_refused_and_a_run_that_goes_on_keeps_the_configuration_o
 )
 def test_a_damaged_checkpoint_is_one_line(tmp_path, spoil, message):
     run(tmp_path, settings(4))
-    spoil(latest_checkpoint(tmp_path / "checkpoints"))
+    spoil(newest(tmp_path))
     with pytest.raises(ModelError, match=message) as error:
         run(tmp_path, settings(8))
     assert "\n" not in str(error.value)

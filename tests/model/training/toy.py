@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -83,7 +84,7 @@ class ToySource:
             self.seen += positions
             rows = [sample(position, poison=position == self.poison) for position in positions]
             samples_consumed += self.global_batch
-            stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+            stacked: dict[str, Any] = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
             yield PlacedBatch(
                 batch=Batch(**stacked, ids=tuple(f"toy:{epoch}:{position}" for position in positions)),
                 places=list(places),
@@ -103,7 +104,7 @@ class ToyTask:
         return self.net
 
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
-        self.net.calls += 1
+        self.net.get_buffer("calls").add_(1)
         noise = normal_like(batch.images, generators)
         predicted = self.net(batch.images + 0.1 * noise)
         error = (predicted - batch.images.mean(dim=(1, 3, 4))).square().mean()
