@@ -18,7 +18,7 @@ from model.recipes.config import TrainingConfig
 from model.recipes.slat_components import SLAT_PARTS, train_slat_part, trained_slat_parts
 from model.recipes.slat_config import SlatTrainingConfig, load_any_config
 from model.training.progress import TrainingProgress
-from model.training.trainer import StepReport
+from model.training.trainer import TrainingEvent
 
 __all__ = ["main"]
 
@@ -100,7 +100,7 @@ def _train(
     config: TrainingConfig | SlatTrainingConfig,
     folder: Path,
     accelerator: Accelerator,
-    report: Callable[[StepReport], None],
+    report: Callable[[TrainingEvent], None],
 ) -> dict[str, float]:
     if isinstance(config, SlatTrainingConfig):
         return train_slat_part(name, config, folder, accelerator=accelerator, report=report)

@@ -41,7 +41,7 @@ from model.sparse_structure.vae import StructureVae
 from model.sparse_structure.vae_training import VaeTask
 from model.training.checkpoint import latest_checkpoint
 from model.training.task import Task
-from model.training.trainer import StepReport
+from model.training.trainer import TrainingEvent
 from model.weights.weight_file import VAE, load_start, load_weights
 
 __all__ = ["PARTS", "load_stage_one", "train_part", "trained_parts"]
@@ -61,7 +61,7 @@ def train_part(
     folder: Path,
     *,
     accelerator: Accelerator,
-    report: Callable[[StepReport], None],
+    report: Callable[[TrainingEvent], None],
 ) -> dict[str, float]:
     """Train one part (see PARTS) and give its metrics on held-out cameras. Earlier parts must be trained.
 
