@@ -21,9 +21,9 @@ from datagen.sources.hands import HandConfig, resolved_hand
 from datagen.sources.motions import MotionsConfig
 from datagen.sources.objects import ObjectsConfig
 from datagen.version import generator_commit
-from shards.records import Provenance
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
+from shards.storage.records import Provenance
 
 __all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config", "placeless", "provenance_of"]
 

@@ -23,18 +23,17 @@ from shards.errors import (
     ShardError,
     storage_error,
 )
-from shards.records import (
+from shards.schema import ROW_TYPES, SCHEMA_VERSION, ClipRow, FrameRow, ObjectRow
+from shards.storage.parquet import ParquetSource, file_metadata, file_record, local_source, parquet_writer
+from shards.storage.records import (
     DatasetRecord,
     MotionRecord,
     Provenance,
     ShardRecord,
-    fsync_dir,
-    fsync_file,
     parse_record,
     write_record,
 )
-from shards.schema import ROW_TYPES, SCHEMA_VERSION, ClipRow, FrameRow, ObjectRow
-from shards.storage.parquet import ParquetSource, file_metadata, file_record, local_source, parquet_writer
+from shards.storage.whole_file import fsync_dir, fsync_file
 
 __all__ = [
     "begin_dataset",

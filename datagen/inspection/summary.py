@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.table import Table
 
 from shards.reader import ColumnTable, Shard
-from shards.records import ShardRecord
+from shards.storage.records import ShardRecord
 
 __all__ = ["shard_line", "shard_summary", "short_uid"]
 

@@ -30,8 +30,8 @@ from datagen.sampling.scene_sampling import SampledMotion, sample_scene
 from datagen.scene.scene_file import save_scene
 from datagen.sources.hands import open_hand
 from shards.errors import ShardError
-from shards.records import Provenance
 from shards.schema import ClipRow, FrameRow
+from shards.storage.records import Provenance
 from shards.writer import motion_dir, stage_motion, stage_skipped_motion
 
 __all__ = ["RENDER_SCRIPT", "Job", "main", "run_job", "sampled_motion"]

@@ -21,7 +21,7 @@ from datagen.config import DatasetConfig, provenance_of
 from datagen.plan.plan import MotionPlan, Plan
 from datagen.plan.selection_rules import read_takedown, taken_down
 from datagen.processes.child_process import BAD_INPUT, ChildError, run_child
-from shards.records import Provenance, ShardRecord
+from shards.storage.records import Provenance, ShardRecord
 from shards.writer import (
     commit_shard,
     is_motion_staged,
