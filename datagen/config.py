@@ -30,7 +30,12 @@ __all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config", "p
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetConfig:
-    """One dataset, from objects to bytes."""
+    """One dataset, from objects to bytes.
+
+    Complete whatever the source: what only another one reads (`motions.replay`, `objects.registration` and
+    `selection.movement` with simulated motions, `grasp` with recorded ones) is there too, so that another
+    source is a change of one word and no default decides anything.
+    """
 
     name: str
     seed: int

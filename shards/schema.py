@@ -41,8 +41,8 @@ class ObjectRow:
 
     object_uid: str = column(
         "string",
-        meaning="Identity of the object across the data set. Splits hash what comes before an '@': "
-        "variants of one object (other size, mirrored) stay together.",
+        meaning="Identity of the object across the data set. Splits hash what comes before an '@' in the last part "
+        "of its path: variants of one object (other size, mirrored) stay together.",
     )
     name: str = column("string", meaning="Short human name.")
     source: str = column("string", meaning="Collection the object comes from.")
