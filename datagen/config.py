@@ -21,16 +21,21 @@ from datagen.sources.hands import HandConfig, resolved_hand
 from datagen.sources.motions import MotionsConfig
 from datagen.sources.objects import ObjectsConfig
 from datagen.version import generator_commit
-from shards.records import Provenance
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
+from shards.storage.records import Provenance
 
 __all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config", "placeless", "provenance_of"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetConfig:
-    """One dataset, from objects to bytes."""
+    """One dataset, from objects to bytes.
+
+    Complete whatever the source: what only another one reads (`motions.replay`, `objects.registration` and
+    `selection.movement` with simulated motions, `grasp` with recorded ones) is there too, so that another
+    source is a change of one word and no default decides anything.
+    """
 
     name: str
     seed: int

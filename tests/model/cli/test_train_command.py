@@ -14,9 +14,9 @@ from click.testing import CliRunner
 from model.cli.main import main
 from model.cli.weights import weights
 from shards.reader import open_dataset
-from shards.records import write_record
 from shards.splits import SplitRule
 from shards.storage.parquet import file_record
+from shards.storage.records import write_record
 from tests.model.data.balls import uid_of_split, write_balls
 from tests.model.small_run import ROOT, fails, forehoi, small_settings, write_config
 
