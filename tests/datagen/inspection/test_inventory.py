@@ -7,7 +7,7 @@ from datagen.cli.main import main
 from datagen.config import load_config
 from datagen.inspection.inventory import asset_states
 from tests.datagen.hands.official_files import write_html, write_mano
-from tests.datagen.licensed_config import ROOT, write_config, write_inputs
+from tests.datagen.licensed_config import write_config, write_inputs
 
 OPEN = ("open hand", "open skins", "starter objects", "HDRIs")
 LICENSED = (
@@ -32,7 +32,7 @@ def states(path):
 
 
 def test_without_licensed_files_the_open_ones_are_there_and_the_others_say_how_to_get_them():
-    found = states(ROOT / "configs" / "datagen" / "tiny.yaml")
+    found = states("tiny")
     assert set(found) == {*OPEN, "Sweet Home 3D models", *LICENSED}
     assert {found[name].state for name in OPEN} == {"present"}
     for name in LICENSED:
@@ -76,7 +76,7 @@ def test_html_without_mano_says_what_it_lacks(tmp_path):
 
 
 def test_the_command_prints_one_table(tmp_path):
-    result = CliRunner().invoke(main, ["assets", "--config", str(ROOT / "configs/datagen/graspxl.yaml")])
+    result = CliRunner().invoke(main, ["assets", "--config", "graspxl"])
     assert result.exit_code == 0, result.output
     for name in LICENSED:
         assert name in result.output
