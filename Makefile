@@ -17,7 +17,8 @@ HTML_DIR  ?=
 export GRASPXL OBJAVERSE MANO_DIR HTML_DIR
 
 VENV    := .venv
-PIP     := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+# setuptools warns about every editable installation.
+PIP     := PYTHONWARNINGS=ignore $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 RUNTIME := $(VENV)/.runtime-installed
 DEV     := $(VENV)/.dev-installed
 TRAIN   := $(VENV)/.training-installed

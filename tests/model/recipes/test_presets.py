@@ -1,14 +1,17 @@
 """Presets, files that extend them, and what `forehoi config` prints."""
 
+import re
 from dataclasses import replace
+from textwrap import dedent
 
 import pytest
 
 from model.encoders.dino import DinoConfig
+from model.flow import UniformTime
 from model.recipes.config import PRESETS, TrainingConfig, load_config
 from model.recipes.slat_config import load_any_config
 from shards.configuration.presets import preset_names
-from tests.model.small_run import fails, forehoi
+from tests.model.small_run import ROOT, fails, forehoi
 
 NAMES = preset_names(PRESETS)
 ABLATION = """\
@@ -80,3 +83,14 @@ def test_mistakes_name_the_file_and_unknown_presets_the_known(tmp_path):
     line = fails("train", "tiny_slta")
     assert "tiny_slta: no such preset (did you mean 'tiny_slat'?)" in line
     assert ", ".join(NAMES) in line
+
+
+def test_the_examples_of_the_readme_are_configurations(tmp_path):
+    own, sections = re.findall(r"```yaml\n(.*?)```", (ROOT / "configs" / "README.md").read_text(), re.DOTALL)
+    path = tmp_path / "own.yaml"
+    path.write_text(own)
+    assert "stage_one.beta: 1.0 -> 0.0" in forehoi("config", path, "--diff", "tiny")[1].splitlines()
+    path.write_text("extends: tiny\n" + dedent(sections))
+    config = load_config(path)
+    assert isinstance(config.encoders.image, DinoConfig)
+    assert config.stage_one.time == UniformTime()
