@@ -46,15 +46,15 @@ __all__ = ["assets", "grasps", "select"]
 @click.command()
 @config_option
 @plain_errors
-def assets(config_path: Path) -> None:
+def assets(config_name: str) -> None:
     """List every open and licensed input: whether it is there, its version and licence, how to get it.
 
     \b
     Example:
-      datagen assets --config configs/datagen/graspxl.yaml
+      datagen assets --config graspxl
     """
     console = Console()
-    console.print(asset_lines(asset_states(load_config(config_path)), console.width), soft_wrap=True)
+    console.print(asset_lines(asset_states(load_config(config_name)), console.width), soft_wrap=True)
 
 
 @click.command()
@@ -63,15 +63,15 @@ def assets(config_path: Path) -> None:
 @license_option
 @workers_option
 @plain_errors
-def select(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
+def select(config_name: str, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
     """Decide which motions are worth rendering; print how many each rule removes, write the reasons.
 
     \b
     Example:
-      datagen select --config configs/datagen/small.yaml --license-allow cc0,by
+      datagen select --config small --license-allow cc0,by
     """
-    config = load_config(config_path, licence_allow=licence_allow)
-    out = out or default_out(config_path)
+    config = load_config(config_name, licence_allow=licence_allow)
+    out = out or default_out(config_name)
     with CountProgress("looking at objects") as bar:
         selection = select_motions(config, out, workers=workers, report=bar.update)
     console = Console()
@@ -93,14 +93,14 @@ def select(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] |
     help="Motions per object.  [default: 1 simulated, or all recorded]",
 )
 @plain_errors
-def grasps(config_path: Path, objects: tuple[str, ...], motions: int | None) -> None:
+def grasps(config_name: str, objects: tuple[str, ...], motions: int | None) -> None:
     """Simulate or replay grasps without rendering; print success, contact distances and quality.
 
     \b
     Example:
       datagen grasps --object starter/milk --motions 3
     """
-    config = load_config(config_path)
+    config = load_config(config_name)
     with CountProgress("grasping") as bar:
         if config.motions.source == "simulated":
             table = grasp_table(_simulated(config, objects, motions or 1, bar))

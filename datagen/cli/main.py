@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 from rich.console import Console
 
+from datagen.cli.config_command import config_command
 from datagen.cli.count_progress import CountProgress
 from datagen.cli.input_commands import assets, grasps, select
 from datagen.cli.options import (
@@ -45,7 +46,7 @@ def main() -> None:
     """
 
 
-for command in (select, grasps, assets):
+for command in (config_command, select, grasps, assets):
     main.add_command(command)
 
 
@@ -55,15 +56,15 @@ for command in (select, grasps, assets):
 @license_option
 @workers_option
 @plain_errors
-def plan(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
+def plan(config_name: str, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
     """Decide what to render: write dataset.json, selection.parquet and plan.parquet.
 
     \b
     Example:
-      datagen plan --config configs/datagen/paper.yaml --out data/paper
+      datagen plan --config paper --out data/paper
     """
-    config = load_config(config_path, licence_allow=licence_allow)
-    out = out or default_out(config_path)
+    config = load_config(config_name, licence_allow=licence_allow)
+    out = out or default_out(config_name)
     with CountProgress("looking at objects") as bar:
         made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
     _say_selection(selection)
@@ -88,7 +89,7 @@ def plan(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | N
 @license_option
 @plain_errors
 def render(
-    config_path: Path,
+    config_name: str,
     out: Path | None,
     shard: int,
     device: str,
@@ -100,10 +101,10 @@ def render(
 
     \b
     Example:
-      datagen render --config configs/datagen/tiny.yaml --shard 0
+      datagen render --config tiny --shard 0
     """
-    config = load_config(config_path, licence_allow=licence_allow)
-    out = out or default_out(config_path)
+    config = load_config(config_name, licence_allow=licence_allow)
+    out = out or default_out(config_name)
     with CountProgress("looking at objects") as bar:
         made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
     _say_selection(selection)
@@ -111,7 +112,7 @@ def render(
         device=device, workers=workers, threads_per_worker=threads, licence_allow=licence_allow
     )
     with RenderProgress(made.shard(shard)) as progress:
-        record = render_shard(config_path, config, made, out, shard, options, progress.update)
+        record = render_shard(config_name, config, made, out, shard, options, progress.update)
     click.echo(shard_line(record, out))
     click.echo(f"look at it: datagen inspect shard {shard} --out {out} --sheet sheet.png")
 

@@ -36,9 +36,9 @@ from shards.schema import ClipRow, FrameRow
 from shards.storage.records import Provenance
 from shards.writer import motion_dir, stage_motion, stage_skipped_motion
 
-__all__ = ["RENDER_SCRIPT", "Job", "main", "run_job", "sampled_motion"]
+__all__ = ["RENDERER", "Job", "main", "run_job", "sampled_motion"]
 
-RENDER_SCRIPT = Path(__file__).resolve().parents[2] / "blender_scripts" / "render_scene.py"
+RENDERER = (sys.executable, "-m", "datagen.blender")  # a process of its own; see datagen/blender/README.md
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -64,7 +64,7 @@ class Job:
 def main(arguments: list[str] | None = None) -> None:
     """Render and stage one motion; progress as JSON lines on standard output."""
     parser = argparse.ArgumentParser(prog="python -m datagen.jobs.render_motion", description=main.__doc__)
-    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--config", required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--motion", type=int, required=True)
     parser.add_argument("--device", required=True)
@@ -167,14 +167,7 @@ def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderReco
             camera_seconds[event["camera"]] += sum(event["seconds"].values())
             emit(phase="render", done=done, total=n_cameras * n_frames)
 
-    command = [
-        sys.executable,
-        str(RENDER_SCRIPT),
-        "--scene",
-        str(scene_path),
-        "--frames-dir",
-        str(job.work_dir),
-    ]
+    command = [*RENDERER, "--scene", str(scene_path), "--frames-dir", str(job.work_dir)]
     command += ["--device", job.device, "--threads", str(job.threads)]
     with timer.phase("blender"):
         summary = run_child(

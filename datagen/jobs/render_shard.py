@@ -59,7 +59,7 @@ class ShardProgress:
 
 
 def render_shard(
-    config_path: Path,
+    config_name: str | Path,
     config: DatasetConfig,
     plan: Plan,
     out: Path,
@@ -82,7 +82,7 @@ def render_shard(
             for index in staged:
                 report(ShardProgress(motion_index=index, phase="staged", done=1, total=1))
             waiting = [index for index in indices if index not in staged]
-            _run_workers(config_path, out, waiting, shard, options, report)
+            _run_workers(config_name, out, waiting, shard, options, report)
         return commit_shard(out, shard, motion_indices=indices, provenance=provenance)
 
 
@@ -110,7 +110,7 @@ def _take_down(
 
 
 def _run_workers(
-    config_path: Path,
+    config_name: str | Path,
     out: Path,
     motion_indices: list[int],
     shard: int,
@@ -130,7 +130,7 @@ def _run_workers(
             "-m",
             "datagen.jobs.render_motion",
             "--config",
-            str(config_path),
+            str(config_name),
             "--out",
             str(out),
         ]

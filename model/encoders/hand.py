@@ -40,9 +40,7 @@ _COARSEST = max(PYRAMID_CHANNELS)
 _BACKBONE = "backbone."  # frozen, from its own package: not in our file
 _WEIGHTS, _CONFIG = "hand_encoder.safetensors", "hand_encoder.json"
 _PACKAGED = Path(__file__).parent / "data"
-_ACTION = (
-    "Make it with `forehoi train hand_encoder` (configs/model/hands.yaml), or give the folder of a made one."
-)
+_ACTION = "Make it with `forehoi train hand_encoder --config hands`, or give the folder of a made one."
 
 
 @dataclass(frozen=True, kw_only=True)

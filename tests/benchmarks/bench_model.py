@@ -38,7 +38,7 @@ VIEWS = (2, 4, 6, 12)
 
 
 def configuration(name: str) -> TrainingConfig:
-    return load_config(ROOT / "configs" / "model" / f"{name}.yaml")
+    return load_config(name)
 
 
 def stage_one_task(config: TrainingConfig) -> StageOneTask:
@@ -122,7 +122,7 @@ def test_memory_of_a_training_step_by_views(say):
         environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
         peaks[views] = float(done.stdout)
-    say(f"peak memory of a training step of one sample, configs/model/small.yaml, {DEVICE.type}:")
+    say(f"peak memory of a training step of one sample, small, {DEVICE.type}:")
     for views, peak in peaks.items():
         say(f"    {views:2d} views {peak:7.0f} MB  {peak / peaks[2]:4.1f}x")
     say(f"    a view more: {(peaks[12] - peaks[2]) / 10:.0f} MB")

@@ -8,7 +8,7 @@ from datagen.config import load_config
 from datagen.inspection.inventory import AssetState, asset_states
 from datagen.inspection.inventory_table import asset_lines
 from tests.datagen.hands.official_files import write_html, write_mano
-from tests.datagen.licensed_config import ROOT, write_config, write_inputs
+from tests.datagen.licensed_config import write_config, write_inputs
 
 OPEN = ("open hand", "open skins", "starter objects", "HDRIs")
 LICENSED = (
@@ -33,7 +33,7 @@ def states(path):
 
 
 def test_without_licensed_files_the_open_ones_are_there_and_the_others_say_how_to_get_them():
-    found = states(ROOT / "configs" / "datagen" / "tiny.yaml")
+    found = states("tiny")
     assert set(found) == {*OPEN, "Sweet Home 3D models", *LICENSED}
     assert {found[name].state for name in OPEN} == {"present"}
     for name in LICENSED:
@@ -77,11 +77,11 @@ def test_html_without_mano_says_what_it_lacks(tmp_path):
 
 
 def test_the_command_names_every_input_and_breaks_no_path(tmp_path):
-    arguments = ["assets", "--config", str(ROOT / "configs/datagen/graspxl.yaml")]
+    arguments = ["assets", "--config", "graspxl"]
     result = CliRunner().invoke(main, arguments, env={"COLUMNS": "80"})
     assert result.exit_code == 0, result.output
     lines = result.output.splitlines()
-    for state in asset_states(load_config(ROOT / "configs/datagen/graspxl.yaml")):
+    for state in asset_states(load_config("graspxl")):
         assert any(line.startswith(state.name) and line.endswith(state.state) for line in lines)
         assert any(line.split()[-1:] == [state.place.split()[-1]] for line in lines), state.place
         if state.state == "missing":
