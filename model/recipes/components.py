@@ -35,7 +35,6 @@ from model.recipes.config import (
 )
 from model.recipes.dataset_statistics import DatasetStatistics, load_statistics, statistics_of_run
 from model.recipes.frozen_encoders import aggregator_over, given_hand_encoder, image_encoder, with_cache
-from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.sparse_structure.vae_training import VaeTask
@@ -147,7 +146,7 @@ def _stage_one_task(
         hidden=part.hidden,
         channels=part.network.masks.feature_channels,
     )
-    network = StageOne(aggregator, DualBranchFlow(part.network))
+    network = StageOne(aggregator, part.network)
     _start(network, part)
     return StageOneTask(
         network=network,

@@ -61,7 +61,7 @@ def stage_one_task(config: TrainingConfig) -> StageOneTask:
         channels=part.network.masks.feature_channels,
     )
     return StageOneTask(
-        network=StageOne(aggregator, DualBranchFlow(part.network)).to(DEVICE),
+        network=StageOne(aggregator, part.network).to(DEVICE),
         image_encoder=image_encoder.to(DEVICE, torch.float32),
         hand_encoder=hand_encoder.to(DEVICE, torch.float32),
         vae=StructureVae(config.vae.network).to(DEVICE).eval().requires_grad_(False),
@@ -163,7 +163,7 @@ def test_time_of_a_block(name, say):
     x = torch.randn(1, views, masks.grid**2, masks.channels, device=DEVICE, requires_grad=True)
     t = torch.full((1,), 0.5, device=DEVICE)
     t_geometry, t_masks = flow.geometry.t_embedder(t).detach(), flow.masks.t_embedder(t).detach()
-    contexts, weights = flow.context(x).detach(), flow.fusion(x).detach()
+    contexts, weights = flow.context(x, None).detach(), flow.fusion(x).detach()
     one = torch.ones(1, 1, device=DEVICE)
 
     blocks = {
