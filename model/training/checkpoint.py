@@ -38,7 +38,7 @@ _PARTIAL = re.compile(r"\.step-\d{8}\.partial")
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingState:
-    """Where a run stands, apart from tensors. Randomness is a function of the step (`draws.py`)."""
+    """Where a run stands, apart from tensors. Randomness is a function of the step (`step_generators.py`)."""
 
     step: int
     epoch: int
