@@ -1,0 +1,1 @@
+"""The two-stage flow-matching network: training and reconstruction; see README.md."""
