@@ -8,6 +8,7 @@ from accelerate import Accelerator
 from rich.console import Console
 from rich.table import Table
 
+from model.cli.config_command import config_command
 from model.cli.metrics_table import metrics_table
 from model.cli.options import plain_errors
 from model.cli.reconstruct import reconstruct_command
@@ -18,11 +19,11 @@ from model.recipes.config import TrainingConfig
 from model.recipes.slat_components import SLAT_PARTS, train_slat_part, trained_slat_parts
 from model.recipes.slat_config import SlatTrainingConfig, load_any_config
 from model.training.progress import TrainingProgress
-from model.training.trainer import StepReport
+from model.training.trainer import TrainingEvent
 
 __all__ = ["main"]
 
-DEFAULT_CONFIG = Path("configs/model/tiny.yaml")
+DEFAULT_CONFIG = "tiny"
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -32,23 +33,24 @@ def main() -> None:
 
     \b
     Example:
-      forehoi train configs/model/tiny.yaml
+      forehoi train tiny
     """
 
 
+main.add_command(config_command)
 main.add_command(weights)
 main.add_command(reconstruct_command)
 
 
 @main.command()
-@click.argument("what", default=str(DEFAULT_CONFIG))
+@click.argument("what", default=DEFAULT_CONFIG)
 @click.option(
     "--config",
-    "config_path",
-    type=click.Path(path_type=Path, dir_okay=False),
+    "config_name",
+    metavar="NAME|FILE",
     default=DEFAULT_CONFIG,
     show_default=True,
-    help="Configuration, when WHAT names a part.",
+    help="Preset or YAML file, when WHAT names a part.",
 )
 @click.option(
     "--out",
@@ -57,8 +59,8 @@ main.add_command(reconstruct_command)
     help="Folder of checkpoints and logs.  [default: runs/NAME for a configuration NAME.yaml]",
 )
 @plain_errors
-def train(what: str, config_path: Path, out: Path | None) -> None:
-    """Train WHAT: a configuration (all parts that it trains), or one part of it.
+def train(what: str, config_name: str, out: Path | None) -> None:
+    """Train WHAT: a preset or a YAML file (all parts that it trains), or one part of it.
 
     Parts of stage 1: vae, hand_encoder, stage_one; of stage 2: slat_vae, slat_flow.
 
@@ -66,16 +68,16 @@ def train(what: str, config_path: Path, out: Path | None) -> None:
 
     \b
     Example:
-      forehoi train configs/model/tiny.yaml
-      forehoi train hand_encoder --config configs/model/hands.yaml
+      forehoi train tiny
+      forehoi train hand_encoder --config hands
     """
     one_part = what in (*PARTS, *SLAT_PARTS)
-    path = config_path if one_part else Path(what)
-    config = load_any_config(path)
+    name_or_file = config_name if one_part else what
+    config = load_any_config(name_or_file)
     names = trained_slat_parts(config) if isinstance(config, SlatTrainingConfig) else trained_parts(config)
     if one_part:
-        names = (_part_of(config, what, path),)
-    folder = out or Path("runs") / path.stem
+        names = (_part_of(config, what, name_or_file),)
+    folder = out or Path("runs") / Path(name_or_file).stem
     accelerator = Accelerator()
     metrics = {}
     for name in names:
@@ -85,12 +87,15 @@ def train(what: str, config_path: Path, out: Path | None) -> None:
         Console().print(_table(config, metrics, folder))
 
 
-def _part_of(config: TrainingConfig | SlatTrainingConfig, name: str, path: Path) -> str:
+def _part_of(config: TrainingConfig | SlatTrainingConfig, name: str, source: str) -> str:
     """The name, if it is a part of this configuration's stage."""
     parts = SLAT_PARTS if isinstance(config, SlatTrainingConfig) else PARTS
     if name not in parts:
         raise ModelError(
-            path, f"has no {name}", expected=f"a part: {', '.join(parts)}", action="Give the other --config."
+            source,
+            f"has no {name}",
+            expected=f"a part: {', '.join(parts)}",
+            action="Give the other --config.",
         )
     return name
 
@@ -100,7 +105,7 @@ def _train(
     config: TrainingConfig | SlatTrainingConfig,
     folder: Path,
     accelerator: Accelerator,
-    report: Callable[[StepReport], None],
+    report: Callable[[TrainingEvent], None],
 ) -> dict[str, float]:
     if isinstance(config, SlatTrainingConfig):
         return train_slat_part(name, config, folder, accelerator=accelerator, report=report)

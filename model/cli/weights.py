@@ -23,7 +23,7 @@ def weights() -> None:
 
     \b
     Example:
-      forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
+      forehoi weights import TRELLIS-image-large --config paper --out weights/trellis.safetensors
       forehoi weights merge runs/paper --out weights/paper.safetensors
     """
 
@@ -32,11 +32,11 @@ def weights() -> None:
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option(
     "--config",
-    "config_path",
-    type=click.Path(path_type=Path, dir_okay=False),
-    default=Path("configs/model/paper.yaml"),
+    "config_name",
+    metavar="NAME|FILE",
+    default="paper",
     show_default=True,
-    help="Configuration whose networks the weights are for.",
+    help="Preset or YAML file whose networks the weights are for.",
 )
 @click.option(
     "--out",
@@ -46,7 +46,7 @@ def weights() -> None:
     help="Weight file to write; the list of all keys goes beside it, as .keys.json.",
 )
 @plain_errors
-def import_weights(source: Path, config_path: Path, out: Path) -> None:
+def import_weights(source: Path, config_name: str, out: Path) -> None:
     """Convert published TRELLIS weights of the configuration's stage: SOURCE is a folder of them, or one file.
 
     The file that is written is what `vae.weights` and `stage_one.start.weights`, or `slat_vae.weights` and
@@ -54,10 +54,10 @@ def import_weights(source: Path, config_path: Path, out: Path) -> None:
 
     \b
     Example:
-      forehoi weights import TRELLIS-image-large --config configs/model/paper.yaml --out weights/trellis.safetensors
-      forehoi weights import TRELLIS-image-large --config configs/model/paper_slat.yaml --out weights/slat.safetensors
+      forehoi weights import TRELLIS-image-large --config paper --out weights/trellis.safetensors
+      forehoi weights import TRELLIS-image-large --config paper_slat --out weights/slat.safetensors
     """
-    config = load_any_config(config_path)
+    config = load_any_config(config_name)
     if isinstance(config, SlatTrainingConfig):
         networks = slat_networks(config.slat_flow.network, config.slat_vae.network)
     else:

@@ -19,7 +19,6 @@ from model.data.index import FRAME_COLUMNS, MotionIndex, MotionRef
 from model.data.order import RandomStream, SampleKey, random_stream
 from shards.errors import CorruptShardError, ImageError, RowError
 from shards.reader import ColumnTable
-from shards.schema import ObjectRow
 from shards.storage.bounded_cache import BoundedCache
 from shards.storage.frame_pages import FramePages, local_pages
 
@@ -182,32 +181,31 @@ class SampleReader:
         )
 
     def _read_object(self, motion: MotionRef) -> _Object:
-        source = self._index.shards[motion.shard].source("objects")
-        for group in range(source.num_row_groups):
-            uids = source.read_row_group(group, ["object_uid"])["object_uid"].to_pylist()
-            if motion.object_uid in uids:
-                columns = _TARGET_COLUMNS + (_SURFACE_COLUMNS if self._config.surface else ())
-                table = ColumnTable(source.read_row_group(group, list(columns)), ObjectRow, where=source.path)
-                row = uids.index(motion.object_uid)
-                voxels = table["occupancy_64"][row]
-                if len(voxels) and voxels.max() >= OCCUPANCY_VOXELS:
-                    raise RowError("voxel outside 0..63", where=source.path, row=motion.object_uid)
-                return _Object(
-                    T_objmesh_from_canonical=table["T_objmesh_from_canonical"][row],
-                    voxels=voxels,
-                    surface=_surface(table, row) if self._config.surface else None,
-                )
-        raise CorruptShardError("no such object", where=source.path, row=motion.object_uid)
+        shard, uid = self._index.shards[motion.shard], motion.object_uid
+        if not shard.has_object(uid):
+            raise CorruptShardError(
+                "the object of a clip is missing", where=f"{shard.path}/objects.parquet", row=uid
+            )
+        columns = _TARGET_COLUMNS + (_SURFACE_COLUMNS if self._config.surface else ())
+        table = shard.read_object(uid, columns)
+        voxels = table["occupancy_64"][0]
+        if len(voxels) and voxels.max() >= OCCUPANCY_VOXELS:
+            raise RowError("voxel outside 0..63", where=table.where)
+        return _Object(
+            T_objmesh_from_canonical=table["T_objmesh_from_canonical"][0],
+            voxels=voxels,
+            surface=_surface(table) if self._config.surface else None,
+        )
 
 
-def _surface(table: ColumnTable, row: int) -> SurfaceTarget:
+def _surface(table: ColumnTable) -> SurfaceTarget:
     return SurfaceTarget(
-        points=table["surface_points"][row],
-        normals=table["surface_normals"][row],
-        colors=table["surface_colors"][row],
-        sdf_points=table["sdf_points"][row],
-        sdf_values=table["sdf_values"][row],
-        object_scale_m=float(table["object_scale_m"][row]),
+        points=table["surface_points"][0],
+        normals=table["surface_normals"][0],
+        colors=table["surface_colors"][0],
+        sdf_points=table["sdf_points"][0],
+        sdf_values=table["sdf_values"][0],
+        object_scale_m=float(table["object_scale_m"][0]),
     )
 
 

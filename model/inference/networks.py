@@ -12,13 +12,14 @@ import torch
 from model.encoders.hand import HandNet, packaged_hand_net
 from model.errors import ModelError
 from model.recipes.components import load_stage_one, trained_parts
-from model.recipes.config import TrainingConfig
+from model.recipes.config import PRESETS, TrainingConfig
 from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, trained_slat_parts
 from model.recipes.slat_config import SlatTrainingConfig, parse_any_config
 from model.sparse_structure.stage_one import StageOneTask
 from model.structured_latent.flow_training import SlatFlowTask
 from model.training.checkpoint import latest_checkpoint, read_state
 from model.training.config import TrainerConfig
+from shards.configuration.presets import preset_names
 
 __all__ = [
     "Checkpoint",
@@ -179,6 +180,5 @@ def _newest(run: Path, part: str) -> Path:
 
 
 def _config_of(run: Path) -> str:
-    """The configuration that trains a run of this name, as far as there is one."""
-    path = Path("configs/model") / f"{run.name}.yaml"
-    return str(path) if path.is_file() else "CONFIG"
+    """The preset that trains a run of this name, as far as there is one."""
+    return run.name if run.name in preset_names(PRESETS) else "CONFIG"

@@ -23,7 +23,7 @@ from model.recipes.config import Recipe, ValidationConfig
 from model.recipes.shard_source import StreamSource
 from model.training.checkpoint import latest_checkpoint, load_average, read_state, require_data
 from model.training.task import Evaluation, SharedValidation, Task
-from model.training.trainer import StepReport, train
+from model.training.trainer import TrainingEvent, train
 
 __all__ = ["PartData", "load_part", "one_pass", "part_data", "require_same_data", "run_part"]
 
@@ -85,7 +85,7 @@ def run_part(
     config_yaml: str,
     config_sha256: str,
     accelerator: Accelerator,
-    report: Callable[[StepReport], None],
+    report: Callable[[TrainingEvent], None],
 ) -> dict[str, float]:
     """Train to the end, from where it was stopped, and give the metrics of the last validation."""
     last: list[Evaluation] = []

@@ -35,13 +35,12 @@ from model.recipes.config import (
 )
 from model.recipes.dataset_statistics import DatasetStatistics, load_statistics, statistics_of_run
 from model.recipes.frozen_encoders import aggregator_over, given_hand_encoder, image_encoder, with_cache
-from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.sparse_structure.vae_training import VaeTask
 from model.training.checkpoint import latest_checkpoint
 from model.training.task import Task
-from model.training.trainer import StepReport
+from model.training.trainer import TrainingEvent
 from model.weights.weight_file import VAE, load_start, load_weights
 
 __all__ = ["PARTS", "load_stage_one", "train_part", "trained_parts"]
@@ -61,7 +60,7 @@ def train_part(
     folder: Path,
     *,
     accelerator: Accelerator,
-    report: Callable[[StepReport], None],
+    report: Callable[[TrainingEvent], None],
 ) -> dict[str, float]:
     """Train one part (see PARTS) and give its metrics on held-out cameras. Earlier parts must be trained.
 
@@ -147,7 +146,7 @@ def _stage_one_task(
         hidden=part.hidden,
         channels=part.network.masks.feature_channels,
     )
-    network = StageOne(aggregator, DualBranchFlow(part.network))
+    network = StageOne(aggregator, part.network)
     _start(network, part)
     return StageOneTask(
         network=network,

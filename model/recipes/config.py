@@ -1,4 +1,4 @@
-"""The whole configuration of a training: one complete YAML file, every key checked.
+"""The whole configuration of a training: YAML that is complete once merged, every key checked.
 
 Each section is a dataclass beside the code it configures; this file assembles them and reads the
 YAML strictly.
@@ -16,17 +16,18 @@ from model.encoders.efficientnet import EfficientNetConfig
 from model.encoders.hand import HandNetConfig
 from model.encoders.hand_training import HandLossConfig
 from model.encoders.wilor import WilorConfig
-from model.errors import ModelError
 from model.flow import LogitNormalTime, SamplerSettings, UniformTime
 from model.networks.lora import LoraSettings
 from model.sparse_structure.dual_branch import DualBranchConfig
 from model.sparse_structure.vae import VaeConfig
 from model.training.config import OptimizerConfig, TrainerConfig
 from model.weights.weight_file import StartConfig
+from shards.configuration.layers import MergedSettings, Replacement, read_layers
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import Split
 
 __all__ = [
+    "PRESETS",
     "EncodersConfig",
     "HandPart",
     "ImportedVae",
@@ -41,11 +42,13 @@ __all__ = [
     "load_config",
     "parse_config",
     "parse_yaml",
-    "read_yaml",
+    "read_settings",
     "require_adapter",
     "require_condition",
     "require_held_out",
 ]
+
+PRESETS = (Path(__file__).parents[1] / "presets").resolve()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,30 +235,33 @@ def require_condition(drop_condition: float, guidance_strength: float) -> None:
         )
 
 
-def read_yaml(path: Path) -> object:
-    """Content of a configuration's file. ModelError when there is none, SettingsError when it is no YAML."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise ModelError(
-            path, "does not exist", expected="a training configuration", action="See configs/model."
-        ) from error
-    except UnicodeDecodeError as error:
-        raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    return parse_yaml(text, where=str(path))
+def read_settings(name: str | Path) -> MergedSettings:
+    """Content of a preset, `tiny`, or a file, `path/to/own.yaml`, merged with what it extends. SettingsError."""
+    return read_layers(name, PRESETS, parse_yaml)
 
 
-def parse_yaml(text: str, *, where: str) -> object:
+class _Loader(yaml.SafeLoader):
+    """Plain content and `!replace`."""
+
+    def replacement(self, node: yaml.Node) -> Replacement:
+        return Replacement(self.construct_mapping(node, deep=True))  # type: ignore[arg-type]  # refuses others itself
+
+
+_Loader.add_constructor("!replace", _Loader.replacement)
+
+
+def parse_yaml(text: str, where: str) -> object:
     """Content of YAML text; `where` names it in errors. SettingsError."""
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
 
 
-def load_config(path: Path) -> TrainingConfig:
-    """Read a complete YAML file of stage 1; SettingsError names file, key, expected and found."""
-    return settings_from_dict(TrainingConfig, read_yaml(path), where=str(path))
+def load_config(name: str | Path) -> TrainingConfig:
+    """The configuration of stage 1 in a preset or a file; SettingsError names file, key, expected and found."""
+    merged = read_settings(name)
+    return settings_from_dict(TrainingConfig, merged.data, where=merged.origins)
 
 
 def parse_config(text: str, *, where: str) -> TrainingConfig:

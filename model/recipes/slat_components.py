@@ -33,7 +33,7 @@ from model.structured_latent.vae.latent import LatentNormalisation
 from model.structured_latent.vae_training import SlatVae, SlatVaeTask
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.training.task import Task
-from model.training.trainer import StepReport
+from model.training.trainer import TrainingEvent
 from model.weights.slat import load_slat_vae, load_stage_two_start
 from model.weights.weight_file import weights_sha256
 
@@ -54,7 +54,7 @@ def train_slat_part(
     folder: Path,
     *,
     accelerator: Accelerator,
-    report: Callable[[StepReport], None],
+    report: Callable[[TrainingEvent], None],
 ) -> dict[str, float]:
     """Train one part (see SLAT_PARTS) and give its metrics on held-out views. The VAE comes first.
 

@@ -1,4 +1,4 @@
-"""The configuration of stage 2: one complete YAML file, every key checked, beside the one of stage 1."""
+"""The configuration of stage 2: every key checked, beside the one of stage 1."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from model.recipes.config import (
     TrainingConfig,
     ValidationConfig,
     parse_yaml,
-    read_yaml,
+    read_settings,
     require_adapter,
     require_condition,
     require_held_out,
@@ -23,7 +23,7 @@ from model.structured_latent.object_features.surface_features import FEATURE_CHA
 from model.structured_latent.object_features.view_features import ViewFeaturesConfig
 from model.structured_latent.vae.latent import SlatVaeConfig
 from model.structured_latent.vae.surface_loss import SurfaceLossConfig
-from shards.settings import settings_from_dict
+from shards.settings import Origins, settings_from_dict
 
 __all__ = [
     "ImportedSlatVae",
@@ -113,12 +113,13 @@ def parse_any_config(text: str, *, where: str) -> TrainingConfig | SlatTrainingC
     return _of_its_stage(parse_yaml(text, where=where), where)
 
 
-def load_any_config(path: Path) -> TrainingConfig | SlatTrainingConfig:
-    """Read a complete YAML file of either stage; SettingsError names file, key, expected and found."""
-    return _of_its_stage(read_yaml(path), str(path))
+def load_any_config(name: str | Path) -> TrainingConfig | SlatTrainingConfig:
+    """The configuration of either stage in a preset or a file; SettingsError names file, key, expected and found."""
+    merged = read_settings(name)
+    return _of_its_stage(merged.data, merged.origins)
 
 
-def _of_its_stage(data: object, where: str) -> TrainingConfig | SlatTrainingConfig:
+def _of_its_stage(data: object, where: str | Origins) -> TrainingConfig | SlatTrainingConfig:
     if isinstance(data, dict) and data.keys() & {"slat_vae", "slat_flow"}:
         return settings_from_dict(SlatTrainingConfig, data, where=where)
     return settings_from_dict(TrainingConfig, data, where=where)

@@ -56,7 +56,7 @@ class Task(Protocol):
         """Everything that has parameters to train; frozen parts may be inside or outside."""
 
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
-        """Loss of a batch. All randomness comes from the generators, one per sample (`draws.py`)."""
+        """Loss of a batch. All randomness comes from the generators, one per sample (`step_generators.py`)."""
 
     def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
         """Metrics with the weights that the module holds now; no gradients, randomness of its own fixed seed."""

@@ -38,7 +38,7 @@ VIEWS = (2, 4, 6, 12)
 
 
 def configuration(name: str) -> TrainingConfig:
-    return load_config(ROOT / "configs" / "model" / f"{name}.yaml")
+    return load_config(name)
 
 
 def stage_one_task(config: TrainingConfig) -> StageOneTask:
@@ -61,7 +61,7 @@ def stage_one_task(config: TrainingConfig) -> StageOneTask:
         channels=part.network.masks.feature_channels,
     )
     return StageOneTask(
-        network=StageOne(aggregator, DualBranchFlow(part.network)).to(DEVICE),
+        network=StageOne(aggregator, part.network).to(DEVICE),
         image_encoder=image_encoder.to(DEVICE, torch.float32),
         hand_encoder=hand_encoder.to(DEVICE, torch.float32),
         vae=StructureVae(config.vae.network).to(DEVICE).eval().requires_grad_(False),
@@ -122,7 +122,7 @@ def test_memory_of_a_training_step_by_views(say):
         environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
         done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
         peaks[views] = float(done.stdout)
-    say(f"peak memory of a training step of one sample, configs/model/small.yaml, {DEVICE.type}:")
+    say(f"peak memory of a training step of one sample, small, {DEVICE.type}:")
     for views, peak in peaks.items():
         say(f"    {views:2d} views {peak:7.0f} MB  {peak / peaks[2]:4.1f}x")
     say(f"    a view more: {(peaks[12] - peaks[2]) / 10:.0f} MB")
@@ -163,7 +163,7 @@ def test_time_of_a_block(name, say):
     x = torch.randn(1, views, masks.grid**2, masks.channels, device=DEVICE, requires_grad=True)
     t = torch.full((1,), 0.5, device=DEVICE)
     t_geometry, t_masks = flow.geometry.t_embedder(t).detach(), flow.masks.t_embedder(t).detach()
-    contexts, weights = flow.context(x).detach(), flow.fusion(x).detach()
+    contexts, weights = flow.context(x, None).detach(), flow.fusion(x).detach()
     one = torch.ones(1, 1, device=DEVICE)
 
     blocks = {

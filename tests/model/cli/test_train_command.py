@@ -8,15 +8,15 @@ from pathlib import Path
 import click
 import pyarrow.parquet as pq
 import pytest
-import yaml
 from click.testing import CliRunner
 
 from model.cli.main import main
 from model.cli.weights import weights
+from model.recipes.config import read_settings
 from shards.reader import open_dataset
-from shards.records import write_record
 from shards.splits import SplitRule
 from shards.storage.parquet import file_record
+from shards.storage.records import write_record
 from tests.model.data.balls import uid_of_split, write_balls
 from tests.model.small_run import ROOT, fails, forehoi, small_settings, write_config
 
@@ -177,7 +177,7 @@ def test_a_missing_column(tmp_path):
 
 
 def test_the_paper_without_its_weights_says_how_to_make_them(dataset, tmp_path, monkeypatch):
-    settings = yaml.safe_load((ROOT / "configs" / "model" / "paper.yaml").read_text())
+    settings = read_settings("paper").data
     settings["data"] |= {"datasets": [str(dataset)], "workers": 0, "cameras": "train"}
     settings["stage_one"]["recipe"] |= {"views": [1, 2]}
     settings["validation"] |= {"views": 1, "split": "train"}

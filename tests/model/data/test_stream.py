@@ -17,15 +17,15 @@ from model.data.batch import Batch
 from model.data.index import FRAME_COLUMNS
 from model.data.order import SampleKey
 from model.data.reader import SampleReader
-from model.data.stream import ShardStream, StreamState, check_object_splits, open_motions, validation_config
+from model.data.stream import ShardStream, StreamState, open_motions, validation_config
 from model.errors import ModelError
-from shards.errors import CorruptShardError, ImageError, MissingColumnError
+from shards.errors import CorruptShardError, DatasetNotFoundError, ImageError, MissingColumnError, SplitError
 from shards.reader import open_dataset
-from shards.records import write_record
-from shards.schema import FrameRow
+from shards.schema import FrameRow, ObjectRow
 from shards.splits import SplitRule
 from shards.storage.images import encode_rgb_png
 from shards.storage.parquet import ParquetSource, file_record
+from shards.storage.records import write_record
 from tests.model.data.balls import stream_config, take, uid_of_split, write_balls
 
 
@@ -226,7 +226,7 @@ def assert_one_line(error: BaseException, *parts: str) -> None:
 
 def test_no_finished_shard(tmp_path):
     write_balls(tmp_path, splits=())
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(DatasetNotFoundError) as caught:
         open_motions(stream_config(tmp_path))
     assert_one_line(caught.value, str(tmp_path), "no finished shard")
 
@@ -242,15 +242,20 @@ def test_an_object_in_two_splits_is_refused(balls, tmp_path):
     uid = uid_of_split("train", 0)
     number = int(uid.removeprefix("ball-"))
     other = write_balls(tmp_path, splits=[["val"] * (number + 1)], cameras=1, rule=everything_val)
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(SplitError) as caught:
         open_motions(stream_config(balls, other))
     assert_one_line(caught.value, f"'{uid}'", "shard-00000", "one split")
-    indices = [
-        open_motions(stream_config(balls)),
-        open_motions(stream_config(other, split="val", views=(1, 2))),
-    ]
-    with pytest.raises(ModelError, match=uid):
-        check_object_splits(indices)
+
+
+def test_an_at_sign_in_a_folder_name_makes_no_variant(tmp_path):
+    """Different objects of a folder `batch@1` may be in different splits."""
+
+    def named(row: ObjectRow) -> ObjectRow:
+        return replace(row, object_uid=f"batch@1/{row.object_uid}")
+
+    index = open_motions(stream_config(write_balls(tmp_path, change_object=named)))
+    assert {motion.object_uid.partition("/")[0] for motion in index.motions} == {"batch@1"}
+    assert len(index.motions) == 3
 
 
 def test_more_views_than_frames(balls):

@@ -4,15 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import yaml
 from safetensors.torch import load_file, save_file
 
 from model.inference.networks import open_stage_one
 from model.recipes.components import load_stage_one
+from model.recipes.config import read_settings
 from model.training.checkpoint import latest_checkpoint
-from tests.model.small_run import ROOT, forehoi, small_settings, write_config
+from tests.model.small_run import forehoi, small_settings, write_config
 
-TINY_SLAT = ROOT / "configs" / "model" / "tiny_slat.yaml"
 FILLED = 0.004  # of the cube, once `fill_some` has been called
 _LAST_BIAS = "decoder.out_layer.2.bias"
 
@@ -27,7 +26,7 @@ def small_stage_one(dataset: Path) -> dict[str, Any]:
 
 def small_stage_two(dataset: Path) -> dict[str, Any]:
     """The content of a configuration of stage 2."""
-    config = yaml.safe_load(TINY_SLAT.read_text())
+    config = read_settings("tiny_slat").data
     config["data"] |= small_settings(dataset)["data"]
     config["validation"] |= {"views": 1, "batch_size": 1, "batches": 1}
     config["encoders"] |= {"image": {"image_size": 64, "grid": 8}, "hand": {"packaged_grid": 8}}

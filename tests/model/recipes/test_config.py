@@ -84,7 +84,7 @@ def test_paper_trains_the_adapters_and_the_new_modules():
     )
     assert part.lora is not None
     with torch.device("meta"):
-        network = StageOne(FeatureAggregator(sizes), DualBranchFlow(part.network))
+        network = StageOne(FeatureAggregator(sizes), part.network)
         add_lora(network.flow.geometry, part.lora)
     counts: dict[str, int] = {}
     for name, parameter in network.named_parameters():

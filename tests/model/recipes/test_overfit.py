@@ -11,14 +11,13 @@ from accelerate import Accelerator
 
 from model.data.stream import ShardStream
 from model.recipes.components import load_stage_one, train_part, trained_parts
-from model.recipes.config import TrainingConfig, parse_config
+from model.recipes.config import TrainingConfig, parse_config, read_settings
 from shards.geometry import intrinsics_from_fov
 from shards.schema import FrameRow
 from shards.storage.images import MASK_BITS, decode_masks, encode_masks, encode_rgb_png, mask_box_px
 from shards.writer import begin_dataset, commit_shard, stage_motion
 from tests.model.data.balls import uid_of_split
 from tests.model.data.voxel_scene import lopsided_occupancy, render_mask
-from tests.model.small_run import TINY
 from tests.shards.synthetic import (
     PROVENANCE,
     dataset_record,
@@ -88,8 +87,8 @@ def _with_object(frame: FrameRow, amodal: np.ndarray) -> FrameRow:
 
 
 def memorising_config(dataset: Path) -> TrainingConfig:
-    """configs/model/tiny.yaml on fixed crops, all of them in every sample, with masks of a cell per pixel."""
-    settings = yaml.safe_load(TINY.read_text())
+    """The preset tiny on fixed crops, all of them in every sample, with masks of a cell per pixel."""
+    settings = read_settings("tiny").data
     settings["data"] |= {
         "datasets": [str(dataset)],
         "workers": 0,

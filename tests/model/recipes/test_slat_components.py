@@ -12,7 +12,7 @@ from safetensors.torch import load_file
 from model.data.stream import ShardStream
 from model.errors import ModelError
 from model.networks.lora import LoraSettings
-from model.recipes.config import TrainingConfig, as_yaml
+from model.recipes.config import TrainingConfig, as_yaml, read_settings
 from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, train_slat_part
 from model.recipes.slat_config import SlatTrainingConfig, load_any_config, parse_any_config
 from model.structured_latent.flow import SlatFlow
@@ -35,7 +35,7 @@ def dataset(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def config(dataset) -> SlatTrainingConfig:
     """tiny_slat.yaml, cut down to seconds."""
-    settings = yaml.safe_load((FOLDER / "tiny_slat.yaml").read_text())
+    settings = read_settings("tiny_slat").data
     settings["data"] |= {
         "datasets": [str(dataset)],
         "workers": 0,
@@ -189,5 +189,5 @@ def test_contradictions_name_both_sides(config):
         parse_any_config(yaml.safe_dump(bad), where="file")
     with pytest.raises(SettingsError, match="slat_flo"):
         parse_any_config(text.replace("slat_flow:", "slat_flo:"), where="file")
-    with pytest.raises(ModelError, match="does not exist"):
+    with pytest.raises(SettingsError, match="no such configuration"):
         load_any_config(FOLDER / "nothing.yaml")

@@ -8,9 +8,9 @@ import torch
 import yaml
 from accelerate import Accelerator
 
+from model.recipes.config import read_settings
 from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, train_slat_part
 from model.recipes.slat_config import SlatTrainingConfig, parse_any_config
-from tests.model.small_run import ROOT
 from tests.model.structured_latent.object_features.textured_ball import write_textured_balls
 
 STEPS = {"slat_vae": 24, "slat_flow": 3}
@@ -18,7 +18,7 @@ STEPS = {"slat_vae": 24, "slat_flow": 3}
 
 def small_config(dataset: Path, cache: Path | None) -> SlatTrainingConfig:
     """tiny_slat.yaml with features of views, cut down to seconds; flips are on."""
-    settings = yaml.safe_load((ROOT / "configs" / "model" / "tiny_slat.yaml").read_text())
+    settings = read_settings("tiny_slat").data
     settings["data"] |= {"datasets": [str(dataset)], "workers": 0, "held_out_cameras": 0.4}
     settings["validation"] |= {"views": 1, "batch_size": 1, "batches": 1}
     settings["encoders"] |= {"image": {"image_size": 64, "grid": 8}, "hand": {"packaged_grid": 8}}

@@ -11,7 +11,7 @@ from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.cached import CachedEncoder
 from model.encoders.hand import HandEncoder, HandNet, HandNetConfig
 from model.flow import Guidance, SamplerSettings, UniformTime
-from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
+from model.sparse_structure.dual_branch import DualBranchConfig
 from model.sparse_structure.geometry_branch import GeometryBranchConfig
 from model.sparse_structure.mask_branch import MaskBranchConfig
 from model.sparse_structure.stage_one import METRICS, StageOne, StageOneConfig, StageOneTask, mask_targets
@@ -50,7 +50,7 @@ def task() -> StageOneTask:
         )
     )
     return StageOneTask(
-        network=StageOne(aggregator, DualBranchFlow(flow)),
+        network=StageOne(aggregator, flow),
         image_encoder=MeanColor(4),
         hand_encoder=MeanColor(2),
         vae=StructureVae(vae).eval().requires_grad_(False),
@@ -95,8 +95,9 @@ def test_the_loss_trains_aggregator_and_both_branches_and_nothing_frozen(task, b
     losses = task.loss(batch, sample_generators(0, 0, range(3)))
     losses.total.backward()
     assert set(losses.parts) == {"masks", "geometry"}
-    without = [name for name, p in task.module.named_parameters() if p.grad is None or not p.grad.any()]
-    assert not without
+    without = {name for name, p in task.module.named_parameters() if p.grad is None or not p.grad.any()}
+    # A constant added to every view's score changes no weight: rounding decides whether its gradient is zero.
+    assert without <= {"flow.fusion.score.2.bias"}
     assert all(p.grad is None for p in task.vae.parameters())
 
 
@@ -138,7 +139,7 @@ def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(tas
     sizes = replace(task.network.aggregator.config, hand_channels=encoder.channels)
     looking = replace(
         task,
-        network=StageOne(FeatureAggregator(sizes), task.network.flow),
+        network=StageOne(FeatureAggregator(sizes), task.network.flow.config),
         hand_encoder=CachedEncoder(encoder=encoder, max_views=9),
     )
     for bias, expected in ((50.0, float(batch.object_amodal.float().mean())), (-50.0, 0.0)):

@@ -1,7 +1,6 @@
 """The small VAE on the starter objects: what the decoder alone makes of true latents."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from model.structured_latent.vae_training import SlatVae, SlatVaeTask
 from model.training.step_generators import sample_generators
 from tests.model.structured_latent.watertight_shapes import RESOLUTION, batch_of, surface_of
 
-CONFIGS = Path(__file__).parents[3] / "configs"
 STEPS, BATCH = 60, 2  # of the 1,500 x 4 that small_slat.yaml takes: more can only help
 UNSEEN = 12
 
@@ -32,12 +30,12 @@ def starter_object(pack: StarterPack, uid: str, config: TargetsConfig) -> tuple[
 
 @pytest.mark.slow
 def test_surfaces_of_true_latents_are_right_to_five_millimetres(capsys):
-    config = load_any_config(CONFIGS / "model" / "small_slat.yaml")
+    config = load_any_config("small_slat")
     assert isinstance(config, SlatTrainingConfig)
     part = config.slat_vae
     assert isinstance(part, SlatVaePart)
     pack = StarterPack()
-    targets = load_datagen_config(CONFIGS / "datagen" / "small.yaml").targets
+    targets = load_datagen_config("small").targets
     objects = [starter_object(pack, uid, targets) for uid in pack.uids()]
     training = objects[UNSEEN:]
     torch.manual_seed(0)

@@ -56,8 +56,8 @@ SMALL_VAE = SlatVaeConfig(
 
 @pytest.fixture(scope="module")
 def paper() -> SlatTrainingConfig:
-    """configs/model/paper_slat.yaml."""
-    config = load_any_config(ROOT / "configs" / "model" / "paper_slat.yaml")
+    """The preset paper_slat."""
+    config = load_any_config("paper_slat")
     assert isinstance(config, SlatTrainingConfig)
     return config
 

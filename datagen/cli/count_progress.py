@@ -1,17 +1,18 @@
-"""A progress bar on standard error while objects are looked at; nothing when there is nothing to wait for."""
+"""A progress bar on standard error over things that are counted; nothing when there is nothing to wait for."""
 
 from types import TracebackType
 
+import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-__all__ = ["SelectionProgress"]
+__all__ = ["CountProgress"]
 
 
-class SelectionProgress:
-    """Context manager; `update` is the `report` of `select_motions`."""
+class CountProgress:
+    """Context manager. `update` is the `report` of `select_motions`."""
 
-    def __init__(self, what: str = "looking at objects") -> None:
+    def __init__(self, what: str) -> None:
         console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("{task.description}"),
@@ -31,7 +32,14 @@ class SelectionProgress:
             self._bar.add_task(self._what, total=total)
         self._bar.update(self._bar.task_ids[0], completed=done, total=total, description=what or self._what)
 
-    def __enter__(self) -> "SelectionProgress":
+    def print(self, line: str) -> None:
+        """A line of results on standard output. The bar goes, until the next `update` begins a new count."""
+        self._bar.stop()  # or rich would send the line where the bar is
+        for task in self._bar.task_ids:
+            self._bar.remove_task(task)
+        click.echo(line)
+
+    def __enter__(self) -> "CountProgress":
         return self
 
     def __exit__(

@@ -2,8 +2,8 @@
 
 import pytest
 
+from shards.commands.plain_errors import plain_errors
 from shards.errors import ImageError, ShardError
-from shards.plain_errors import plain_errors
 
 
 class StoppedError(Exception):

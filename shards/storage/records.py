@@ -1,12 +1,11 @@
 """The JSON files: dataset.json, shard.json and the motion.json of a staged motion.
 
-Each is written in one step (temporary file, fsync, rename) and carries the SHA-256 of its
-own content, so that a damaged one is recognised.
+Each is written whole or not at all, and carries the SHA-256 of its own content, so that a damaged
+one is recognised.
 """
 
 import hashlib
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TypeVar
@@ -15,6 +14,7 @@ from shards.errors import ChecksumError, CorruptShardError, SchemaVersionError, 
 from shards.schema import SCHEMA_VERSION
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
+from shards.storage.whole_file import write_whole
 
 __all__ = [
     "DatasetRecord",
@@ -23,8 +23,6 @@ __all__ = [
     "Provenance",
     "ShardRecord",
     "check_schema_version",
-    "fsync_dir",
-    "fsync_file",
     "parse_record",
     "write_record",
 ]
@@ -104,12 +102,9 @@ def write_record(path: Path, record: object) -> None:
     text = json.dumps(
         {"sha256": _digest(content), "record": content}, indent=1, sort_keys=True, ensure_ascii=False
     )
-    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        temporary.write_text(text + "\n", encoding="utf-8")
-        fsync_file(temporary)
-        os.replace(temporary, path)
-        fsync_dir(path.parent)
+        with write_whole(path, durable=True) as partial:
+            partial.write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise storage_error(error, path, doing="writing", needed_bytes=len(text)) from error
 
@@ -146,17 +141,6 @@ def check_schema_version(version: str, *, where: str) -> None:
         fix = f"read it with a release of schema {major}.x, or render it again"
         raise SchemaVersionError("older schema", where=where, expected=SCHEMA_VERSION, found=version, fix=fix)
 
-
-def fsync_file(path: Path) -> None:
-    """Force a file's content to the disk."""
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-fsync_dir = fsync_file  # a directory's entries, by the same call
 
 _RESTORE = "restore the file from another copy, or delete its shard and make it again"
 
