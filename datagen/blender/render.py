@@ -45,8 +45,7 @@ def render_scene(
 ) -> None:
     """Write all images that are not there yet, frames outer and cameras inner.
 
-    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop (metrics in
-    DECISIONS.md).
+    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop (DECISIONS D81).
     Raises DeviceError, TextureError, RenderError.
     """
     started = time.perf_counter()

@@ -1,5 +1,5 @@
 """The open hand encoder: a small decoder on the frozen ImageNet pyramid, trained on our own shards to find the hand,
-its 21 joints and what it holds. On few images this beats a network trained from nothing by far (DECISIONS.md).
+its 21 joints and what it holds. On few images this beats a network trained from scratch by far (DECISIONS D39).
 
 `forehoi train hand_encoder` makes its weights (`hand_training.py`); `packaged_hand_net` gives those that ship with
 the package (model/encoders/data). It sees the same crop as the image encoder.
