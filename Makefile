@@ -3,7 +3,7 @@ SHELL := /bin/bash
 .DEFAULT_GOAL := help
 
 SHARD  ?= 0
-CONFIG ?= configs/datagen/tiny.yaml
+CONFIG ?= tiny
 OUT    ?= data/$(basename $(notdir $(CONFIG)))
 DATA   ?= data/tiny
 PYTHON ?= python3.11
@@ -17,7 +17,8 @@ HTML_DIR  ?=
 export GRASPXL OBJAVERSE MANO_DIR HTML_DIR
 
 VENV    := .venv
-PIP     := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+# setuptools warns about every editable installation.
+PIP     := PYTHONWARNINGS=ignore $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 RUNTIME := $(VENV)/.runtime-installed
 DEV     := $(VENV)/.dev-installed
 TRAIN   := $(VENV)/.training-installed
@@ -30,10 +31,20 @@ help: ## list the targets and their variables
 	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) ARGS=$(ARGS) PYTHON=$(PYTHON)"
 	@echo "places of licensed inputs: GRASPXL=$(GRASPXL) OBJAVERSE=$(OBJAVERSE) MANO_DIR=$(MANO_DIR) HTML_DIR=$(HTML_DIR)"
 
+# Blender's module exists for Python 3.11 alone. Debian's python3.11 makes no environments without python3.11-venv.
 $(VENV)/bin/python:
-	@command -v $(PYTHON) >/dev/null || { echo "make: $(PYTHON) not found. Blender's module needs Python 3.11: install it, or name it: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11"; exit 2; }
-	@echo "creating $(VENV)"
-	@$(PYTHON) -m venv $(VENV)
+	@if $(PYTHON) -c 'import ensurepip, sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then \
+		echo "creating $(VENV) with $(PYTHON)"; \
+		$(PYTHON) -m venv $(VENV); \
+	elif test "$(origin PYTHON)" = file && command -v uv >/dev/null; then \
+		echo "creating $(VENV) with uv, which finds or downloads Python 3.11"; \
+		uv venv --quiet --python 3.11 --seed $(VENV); \
+	else \
+		echo "make: $(PYTHON) is no Python 3.11 that can make environments, and Blender's module needs 3.11." \
+			"Install uv, which brings one (pipx install uv), or on Debian 12: apt-get install python3.11-venv," \
+			"or name one: make $(MAKECMDGOALS) PYTHON=/path/to/python3.11" >&2; \
+		exit 2; \
+	fi
 
 $(RUNTIME): $(VENV)/bin/python pyproject.toml requirements.lock
 	@echo "installing the generator (about a minute)"
@@ -54,34 +65,34 @@ $(TRAIN): $(RUNTIME)
 setup: $(RUNTIME) ## create .venv and install the generator
 
 render: $(RUNTIME) ## plan CONFIG into OUT if needed, then render shard SHARD
-	@$(VENV)/bin/datagen render --config $(CONFIG) --out $(OUT) --shard $(SHARD) $(ARGS)
+	$(VENV)/bin/datagen render --config $(CONFIG) --out $(OUT) --shard $(SHARD) $(ARGS)
 
-train: $(TRAIN) ## train configs/model/tiny.yaml on shard 0 of DATA, rendering it if absent
+train: $(TRAIN) ## train the preset tiny on shard 0 of DATA, rendering it if absent
 	@test -f $(DATA)/shards/shard-00000/shard.json || $(MAKE) --no-print-directory render SHARD=0 OUT=$(DATA)
-	@$(VENV)/bin/forehoi train configs/model/tiny.yaml $(ARGS)
+	$(VENV)/bin/forehoi train tiny $(ARGS)
 
 # figures.json of a part is written when its training is finished; a stopped one is continued.
 demo: $(TRAIN) ## train both stages of tiny unless that is done, then reconstruct a held-out clip into runs/demo
 	@test -f $(DATA)/shards/shard-00000/shard.json -a -f runs/tiny/stage_one/figures.json || \
 		$(MAKE) --no-print-directory train ARGS=
-	@test -f runs/tiny_slat/slat_flow/figures.json || $(VENV)/bin/forehoi train configs/model/tiny_slat.yaml
-	@$(VENV)/bin/forehoi reconstruct --held-out --out runs/demo --overwrite $(ARGS)
+	@test -f runs/tiny_slat/slat_flow/figures.json || { set -x; $(VENV)/bin/forehoi train tiny_slat; }
+	$(VENV)/bin/forehoi reconstruct --held-out --out runs/demo --overwrite $(ARGS)
 
 test: $(DEV) ## run the tests, without those marked slow
-	@$(VENV)/bin/python -m pytest -q -m "not slow" $(ARGS)
+	$(VENV)/bin/python -m pytest -q -m "not slow" $(ARGS)
 
 test-slow: $(DEV) ## run the tests that take minutes
-	@$(VENV)/bin/python -m pytest -q -m slow $(ARGS)
+	$(VENV)/bin/python -m pytest -q -m slow $(ARGS)
 
 check: $(DEV) ## lint, types, import contracts, then the tests
-	@$(VENV)/bin/ruff check .
-	@$(VENV)/bin/ruff format --check .
-	@$(VENV)/bin/lint-imports
-	@$(VENV)/bin/mypy
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/lint-imports
+	$(VENV)/bin/mypy
 	@$(MAKE) --no-print-directory test
 
 bench: $(DEV) ## measure the performance claims of README.md on this machine
-	@$(VENV)/bin/python -m pytest -q -s tests/benchmarks --override-ini "python_files=bench_*.py" --override-ini addopts=--import-mode=importlib $(ARGS)
+	$(VENV)/bin/python -m pytest -q -s tests/benchmarks --override-ini "python_files=bench_*.py" --override-ini addopts=--import-mode=importlib $(ARGS)
 
 clean: ## remove .venv and caches; rendered data stays
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks *.egg-info

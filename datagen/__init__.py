@@ -1,0 +1,1 @@
+"""The generator: grasp sequences, scenes, Blender, annotation, shards; see README.md."""

@@ -1,5 +1,17 @@
-"""`python -m datagen` is the `datagen` command."""
+"""`datagen` and `python -m datagen`."""
 
-from datagen.cli.main import main
+from shards.commands.extras import needs_extra
 
-main()
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command, or say which extra is not installed; nothing of it is imported before."""
+    with needs_extra("datagen", "datagen", make="setup"):
+        from datagen.cli.main import main as command
+
+        command()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""The whole configuration of a dataset: one complete YAML file, every key checked.
+"""The whole configuration of a dataset: YAML that is complete once merged, every key checked.
 
 Each section is a dataclass beside the code it configures; this file only assembles
 them, reads the YAML strictly and compares configurations.
@@ -21,16 +21,33 @@ from datagen.sources.hands import HandConfig, resolved_hand
 from datagen.sources.motions import MotionsConfig
 from datagen.sources.objects import ObjectsConfig
 from datagen.version import generator_commit
-from shards.records import Provenance
+from shards.configuration.layers import Replacement, read_layers
 from shards.settings import SettingsError, settings_from_dict
 from shards.splits import SplitRule
+from shards.storage.records import Provenance
 
-__all__ = ["DatasetConfig", "config_as_yaml", "config_sha256", "load_config", "placeless", "provenance_of"]
+__all__ = [
+    "PRESETS",
+    "DatasetConfig",
+    "config_as_yaml",
+    "config_sha256",
+    "load_config",
+    "placeless",
+    "provenance_of",
+    "read_config",
+]
+
+PRESETS = (Path(__file__).parent / "presets").resolve()
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetConfig:
-    """One dataset, from objects to bytes."""
+    """One dataset, from objects to bytes.
+
+    Complete whatever the source: what only another one reads (`motions.replay`, `objects.registration` and
+    `selection.movement` with simulated motions, `grasp` with recorded ones) is there too, so that another
+    source is a change of one word and no default decides anything.
+    """
 
     name: str
     seed: int
@@ -54,33 +71,51 @@ class DatasetConfig:
             )
 
 
-def load_config(path: Path, *, licence_allow: tuple[str, ...] | None = None) -> DatasetConfig:
-    """Read a complete YAML file; SettingsError names file, key, expected and found.
+def load_config(name: str | Path, *, licence_allow: tuple[str, ...] | None = None) -> DatasetConfig:
+    """The configuration of a preset or of a file (see `read_config`), as it is used on this machine.
 
     `auto` settings are decided here, by what is on this machine, so that the configuration names
     what is really used. `licence_allow` takes the place of selection.licence_allow.
     """
-    try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise SettingsError(
-            f"{path}: no such configuration; configs/datagen holds tiny, small and paper"
-        ) from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: not valid YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, dict):
-        raise SettingsError(f"{path}: expected a mapping of settings, found {type(data).__name__}")
-    config = settings_from_dict(DatasetConfig, data, where=str(path))
+    config = read_config(name)
+    if licence_allow is not None:
+        config = replace(config, selection=replace(config.selection, licence_allow=licence_allow))
+    return replace(config, hand=resolved_hand(config.hand))
+
+
+def read_config(name: str | Path) -> DatasetConfig:
+    """The configuration as it is written in a preset, `tiny`, or a file, `path/to/own.yaml`, and what it extends.
+
+    SettingsError names file, key, expected and found.
+    """
+    merged = read_layers(name, PRESETS, _parsed)
+    config = settings_from_dict(DatasetConfig, merged.data, where=merged.origins)
     selection = config.selection
     if selection.takedown is not None:
-        selection = replace(selection, takedown=(path.parent / selection.takedown.expanduser()).resolve())
-    if licence_allow is not None:
-        selection = replace(selection, licence_allow=licence_allow)
-    return replace(config, hand=resolved_hand(config.hand), selection=selection)
+        beside = Path(merged.origins["selection.takedown"]).parent
+        selection = replace(selection, takedown=(beside / selection.takedown.expanduser()).resolve())
+    return replace(config, selection=selection)
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain content and `!replace`."""
+
+    def replacement(self, node: yaml.Node) -> Replacement:
+        return Replacement(self.construct_mapping(node, deep=True))  # type: ignore[arg-type]  # refuses others itself
+
+
+_Loader.add_constructor("!replace", _Loader.replacement)
+
+
+def _parsed(text: str, where: str) -> object:
+    try:
+        return yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
 
 
 def config_as_yaml(config: DatasetConfig) -> str:
-    """The complete configuration as it is stored in dataset.json; `load_config` reads it back."""
+    """The complete configuration as it is stored in dataset.json; `read_config` reads it back."""
     plain = json.loads(json.dumps(asdict(config), default=str))
     return yaml.safe_dump(plain, sort_keys=False)
 

@@ -6,21 +6,27 @@ from pathlib import Path
 
 __all__ = ["generator_commit"]
 
+ROOT = Path(__file__).resolve().parents[1]
+
 
 def generator_commit() -> str:
-    """The git commit of this checkout, '+' when files differ from it; else the package version."""
-    root = Path(__file__).resolve().parent.parent
-    if not (root / ".git").exists():
-        return f"forehoi-open {version('forehoi-open')}"
-    commit = subprocess.run(
-        ["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=False
-    )
-    if commit.returncode != 0:  # a checkout without a commit, or without git
-        return f"forehoi-open {version('forehoi-open')}"
-    changed = subprocess.run(
-        ["git", "-C", str(root), "status", "--porcelain", "--untracked-files=no"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return commit.stdout.strip() + ("+" if changed.stdout.strip() else "")
+    """The git commit of this checkout, '+' when files differ from it.
+
+    The version of the package where there is no checkout, no git, or no commit that git would tell.
+    """
+    if (ROOT / ".git").exists():
+        commit, changes = _git("rev-parse", "HEAD"), _git("status", "--porcelain", "--untracked-files=no")
+        if commit is not None and changes is not None:
+            return commit + ("+" if changes else "")
+    return f"forehoi-open {version('forehoi-open')}"
+
+
+def _git(*arguments: str) -> str | None:
+    """Output of a git command in this checkout; None when git is not installed or refuses."""
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(ROOT), *arguments], capture_output=True, text=True, check=True
+        )
+    except (FileNotFoundError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()

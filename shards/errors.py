@@ -9,6 +9,7 @@
     │   └── TruncatedError     shorter (or longer) than recorded
     ├── MissingColumnError     a column that is not in the file, or was not asked for
     ├── RowError               a value that does not fit the schema
+    ├── SplitError             one object in two splits
     ├── ImageError             image bytes that cannot be encoded or decoded
     └── StorageError           the disk refused to take or give something
         └── DiskFullError      no space, quota or file-size limit
@@ -31,6 +32,7 @@ __all__ = [
     "RowError",
     "SchemaVersionError",
     "ShardError",
+    "SplitError",
     "StorageError",
     "TruncatedError",
     "storage_error",
@@ -40,7 +42,7 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 
 class ShardError(ValueError):
-    """Base of the family. `str(error)` is one complete line."""
+    """Base of the family. `str(error)` is one complete line, `problem` what is wrong without the rest."""
 
     def __init__(
         self,
@@ -53,6 +55,7 @@ class ShardError(ValueError):
         found: object = None,
         fix: str = "",
     ) -> None:
+        self.problem = problem
         place = [where] if where else []
         place += [f"row {row}"] if row is not None else []
         place += [f"column '{column}'"] if column is not None else []
@@ -93,6 +96,10 @@ class MissingColumnError(ShardError):
 
 class RowError(ShardError):
     """A value does not fit its column."""
+
+
+class SplitError(ShardError):
+    """One object is in two splits, so that what is tested on was trained on."""
 
 
 class ImageError(ShardError):

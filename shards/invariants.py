@@ -68,7 +68,7 @@ def clip_problems(clip: ClipRow, frames: Frames, split_rule: SplitRule | None) -
                 problems.append(f"{name}_{statistic} is not that of the frames")
     if clip.has_table != bool(np.isfinite(clip.table_top_z_m)):
         problems.append("has_table and table_top_z_m disagree")
-    return problems
+    return problems + list(_margin_problems(clip, frames))
 
 
 def frame_problems(frame: Frame, clip: ClipRow) -> list[str]:
@@ -90,6 +90,23 @@ def frame_problems(frame: Frame, clip: ClipRow) -> list[str]:
     if not row.rgb.startswith(_SIGNATURES[clip.rgb_codec]):
         problems.append(f"rgb is not {clip.rgb_codec}")
     return problems
+
+
+def _margin_problems(clip: ClipRow, frames: Frames) -> Iterator[str]:
+    """No amodal mask comes nearer to the border of the image than the vertices of what it shows.
+
+    A pixel is in a mask when its centre is, half a pixel from its edge.
+    """
+    size = np.array([clip.image_width, clip.image_height])
+    for name in ("hand", "object"):
+        boxes = frames[f"{name}_box_amodal_px"].astype(np.float64)
+        boxes = boxes[boxes[:, 0] >= 0]  # -1: empty
+        nearest = np.minimum(boxes[:, :2], size - boxes[:, 2:]).min(initial=np.inf)
+        if nearest < clip.min_margin_px - 0.5 - REPROJECTION_PX:
+            yield (
+                f"the amodal {name} comes to {nearest:.0f} px of the border, min_margin_px says "
+                f"{clip.min_margin_px:.2f}"
+            )
 
 
 def _voxel_problems(row: ObjectRow) -> Iterator[str]:

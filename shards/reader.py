@@ -6,6 +6,7 @@ hash and each column chunk by the CRC in shard.json. Damage raises a ShardError,
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,12 +24,23 @@ from shards.errors import (
     MissingColumnError,
     StorageError,
 )
-from shards.records import DatasetRecord, ShardRecord, parse_record
 from shards.schema import ROW_TYPES, ClipRow, FrameRow, ObjectRow
+from shards.splits import SplitRule
 from shards.storage.images import Geometry, Masks, decode_geometry, decode_masks, decode_rgb
 from shards.storage.parquet import COPY_AGAIN, ParquetSource
+from shards.storage.records import DatasetRecord, ShardRecord, parse_record
 
-__all__ = ["ColumnTable", "Dataset", "Frame", "Frames", "Shard", "open_dataset", "open_shard"]
+__all__ = [
+    "ColumnTable",
+    "Dataset",
+    "Frame",
+    "Frames",
+    "Shard",
+    "find_clip",
+    "open_dataset",
+    "open_shard",
+    "open_shards",
+]
 
 _Image = TypeVar("_Image")  # RGB, masks or geometry of one frame
 
@@ -120,6 +132,14 @@ class Shard:
         """All objects with meshes and samples; `read_objects` reads single columns."""
         return self._rows("objects", ObjectRow)
 
+    def read_split_rule(self) -> SplitRule | None:
+        """The rule of the dataset that the shard lies in; None where it lies alone."""
+        root = self.path.rpartition("/shards/")[0]
+        where = f"{root}/dataset.json"
+        if not root or not self.fs.exists(where):
+            return None
+        return parse_record(_read(self.fs, where), DatasetRecord, where=where).split_rule
+
     def read_clips(self, columns: Sequence[str]) -> ColumnTable:
         """The named columns of all clips."""
         return self._table("clips", columns)
@@ -128,10 +148,27 @@ class Shard:
         """The named columns of all objects."""
         return self._table("objects", columns)
 
+    def has_object(self, object_uid: str) -> bool:
+        """Whether objects.parquet describes the object."""
+        return object_uid in self._object_places
+
+    def read_object(self, object_uid: str, columns: Sequence[str]) -> ColumnTable:
+        """The named columns of one object, a table of one row. DatasetNotFoundError when it is not there."""
+        source = self._sources["objects"]
+        if not self.has_object(object_uid):
+            raise DatasetNotFoundError("no such object", where=source.path, found=object_uid)
+        group, row = self._object_places[object_uid]
+        table = source.read_row_group(group, columns).slice(row, 1)
+        return ColumnTable(table, ObjectRow, where=f"{source.path}, object {object_uid}")
+
+    def read_clip(self, clip_id: str) -> ClipRow:
+        """One clip. DatasetNotFoundError when it is not there."""
+        find_clip([self], clip_id, where=self.path)
+        return next(clip for clip in self.clips() if clip.clip_id == clip_id)
+
     def read_frames(self, clip_id: str, columns: Sequence[str] | None = None) -> Frames:
-        """The frames of one clip; only `columns` are fetched (None: all)."""
-        if clip_id not in self.record.clip_ids:
-            raise DatasetNotFoundError("no such clip", where=self.path, found=clip_id)
+        """The frames of one clip; only `columns` are fetched (None: all). DatasetNotFoundError."""
+        find_clip([self], clip_id, where=self.path)
         group = self.record.clip_ids.index(clip_id)
         source = self._sources["frames"]
         where = f"{source.path}, clip {clip_id}"
@@ -156,6 +193,16 @@ class Shard:
         groups = [source.read_row_group(i, columns) for i in range(source.num_row_groups)]
         empty = arrow_schema(ROW_TYPES[name]).empty_table()
         return ColumnTable(pa.concat_tables(groups) if groups else empty, ROW_TYPES[name], where=source.path)
+
+    @cached_property
+    def _object_places(self) -> dict[str, tuple[int, int]]:
+        """Row group of each object and row within it."""
+        source = self._sources["objects"]
+        return {
+            uid: (group, row)
+            for group in range(source.num_row_groups)
+            for row, uid in enumerate(source.read_row_group(group, ["object_uid"])["object_uid"].to_pylist())
+        }
 
     @cached_property
     def _sources(self) -> dict[str, ParquetSource]:
@@ -191,11 +238,8 @@ class Dataset:
                     yield row
 
     def read_frames(self, clip_id: str, columns: Sequence[str] | None = None) -> Frames:
-        """The frames of one clip; only `columns` are fetched (None: all)."""
-        try:
-            shard = self._shard_of_clip[clip_id]
-        except KeyError:
-            raise DatasetNotFoundError("no such clip", where=self.path, found=clip_id) from None
+        """The frames of one clip; only `columns` are fetched (None: all). DatasetNotFoundError."""
+        shard = self._shard_of_clip.get(clip_id) or find_clip(self.shards, clip_id, where=self.path)
         return shard.read_frames(clip_id, columns)
 
     @cached_property
@@ -209,8 +253,7 @@ def open_dataset(url: str | Path, *, shards: Sequence[int] | None = None) -> Dat
     `shards` names the shards to open, needed where a server cannot list folders; None takes every
     finished one. Raises DatasetNotFoundError, SchemaVersionError, CorruptShardError.
     """
-    fs, root = fsspec.core.url_to_fs(str(url))
-    root = root.rstrip("/")
+    fs, root = _located(url)
     record = parse_record(_read(fs, f"{root}/dataset.json"), DatasetRecord, where=f"{url}/dataset.json")
     if shards is None:
         found = sorted(str(path) for path in fs.glob(f"{root}/shards/shard-*/shard.json"))
@@ -222,8 +265,48 @@ def open_dataset(url: str | Path, *, shards: Sequence[int] | None = None) -> Dat
 
 def open_shard(url: str | Path) -> Shard:
     """Open one shard folder by itself."""
+    fs, path = _located(url)
+    return _shard(fs, path)
+
+
+def open_shards(url: str | Path) -> tuple[Shard, ...]:
+    """The finished shards of a dataset, or the one shard that `url` is. Local or remote, as `open_dataset`.
+
+    DatasetNotFoundError when it is neither, or when no shard is finished.
+    """
+    fs, path = _located(url)
+    if fs.exists(f"{path}/shard.json"):
+        return (_shard(fs, path),)
+    shards = open_dataset(url).shards
+    if not shards:
+        raise DatasetNotFoundError(
+            "no finished shard",
+            where=str(url),
+            expected="at least one shards/shard-*/shard.json",
+            fix="render one (make render SHARD=0), or name shard folders where a server lists nothing",
+        )
+    return shards
+
+
+def find_clip(shards: Sequence[Shard], clip_id: str, *, where: str) -> Shard:
+    """The shard that holds the clip. DatasetNotFoundError, which names the closest clip of `where`."""
+    for shard in shards:
+        if clip_id in shard.record.clip_ids:
+            return shard
+    known = [known_id for shard in shards for known_id in shard.record.clip_ids]
+    close = get_close_matches(clip_id, known, n=1) or known[:1]
+    raise DatasetNotFoundError(
+        "no such clip",
+        where=where,
+        expected=f"one of its {len(known)} clips",
+        found=clip_id,
+        fix=f"is it '{close[0]}'?" if close else "",
+    )
+
+
+def _located(url: str | Path) -> tuple[fsspec.AbstractFileSystem, str]:
     fs, path = fsspec.core.url_to_fs(str(url))
-    return _shard(fs, path.rstrip("/"))
+    return fs, path.rstrip("/")
 
 
 def _shard(fs: fsspec.AbstractFileSystem, path: str) -> Shard:

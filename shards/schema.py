@@ -15,8 +15,6 @@ from shards.columns import column
 
 __all__ = [
     "CONVENTIONS",
-    "DIGITS",
-    "JOINTS",
     "ROW_TYPES",
     "SCHEMA_VERSION",
     "ClipRow",
@@ -25,13 +23,6 @@ __all__ = [
 ]
 
 SCHEMA_VERSION = "1.0.0"
-
-DIGITS = ("thumb", "index", "middle", "ring", "pinky")
-JOINTS = (
-    "wrist",
-    *(f"{digit}{number}" for digit in ("index", "middle", "pinky", "ring", "thumb") for number in (1, 2, 3)),
-    *(f"{digit}_tip" for digit in DIGITS),
-)
 
 CONVENTIONS = (
     "T_b_from_a: x_b = T_b_from_a @ x_a. World: Z up, metres, seconds, radians. "
@@ -50,8 +41,8 @@ class ObjectRow:
 
     object_uid: str = column(
         "string",
-        meaning="Identity of the object across the data set. Splits hash what comes before an '@': "
-        "variants of one object (other size, mirrored) stay together.",
+        meaning="Identity of the object across the data set. Splits hash what comes before an '@' in the last part "
+        "of its path: variants of one object (other size, mirrored) stay together.",
     )
     name: str = column("string", meaning="Short human name.")
     source: str = column("string", meaning="Collection the object comes from.")

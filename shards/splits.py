@@ -4,7 +4,9 @@ import hashlib
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["Split", "SplitRule", "object_identity", "split_of_object"]
+from shards.errors import SplitError
+
+__all__ = ["ObjectSplits", "Split", "SplitRule", "identity_and_variant", "object_identity", "split_of_object"]
 
 Split = Literal["train", "val", "test"]
 
@@ -25,10 +27,19 @@ class SplitRule:
             )
 
 
-def object_identity(object_uid: str) -> str:
-    """The uid without its variant: what follows an "@" in the last part of the path."""
+def identity_and_variant(object_uid: str) -> tuple[str, str]:
+    """A uid in two: "store/cup@large" is ("store/cup", "@large"), "batch@1/cup" is ("batch@1/cup", "").
+
+    A variant begins at the first "@" of the last part of the path; folders may have one in their name.
+    """
     folder, slash, name = object_uid.rpartition("/")
-    return folder + slash + name.partition("@")[0]
+    plain, at, variant = name.partition("@")
+    return folder + slash + plain, at + variant
+
+
+def object_identity(object_uid: str) -> str:
+    """The uid without its variant (another size, the mirror image)."""
+    return identity_and_variant(object_uid)[0]
 
 
 def split_of_object(object_uid: str, rule: SplitRule) -> Split:
@@ -47,3 +58,22 @@ def split_of_object(object_uid: str, rule: SplitRule) -> Split:
     if u < rule.test_fraction + rule.val_fraction:
         return "val"
     return "train"
+
+
+class ObjectSplits:
+    """The split of every object met so far, over any number of shards and datasets."""
+
+    def __init__(self) -> None:
+        self._met: dict[str, tuple[str, str]] = {}  # identity -> split, and where it says so
+
+    def add(self, object_uid: str, split: str, *, where: str) -> None:
+        """SplitError if a variant of the object was met in another split."""
+        identity = object_identity(object_uid)
+        known, known_where = self._met.setdefault(identity, (split, where))
+        if known != split:
+            raise SplitError(
+                f"object '{identity}' is in split {split} here and in {known} in {known_where}",
+                where=where,
+                expected="each object in one split",
+                fix="leave one of the datasets out, or render them with the same split fractions",
+            )

@@ -1,24 +1,25 @@
 """Does a finished shard hold what it says, and do its numbers agree with each other?
 
-`verify_shard` reads everything once: file hashes, rows, every image, and the invariants that
-tie masks, depth, boxes, joints, poses, splits and object samples together (`invariants.py`).
-It collects findings instead of stopping at the first.
+`verify_dataset` reads everything once: file hashes, rows, every image, and the invariants that tie
+masks, depth, boxes, joints, poses, splits and object samples together (`invariants.py`); over all
+shards, that no object is in two splits. It collects findings instead of stopping at the first.
 """
 
 import hashlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from shards.errors import MissingColumnError, ShardError
+from shards.errors import MissingColumnError, ShardError, SplitError
 from shards.invariants import clip_problems, frame_problems, object_problems
-from shards.reader import Dataset, Frames, Shard, open_dataset
+from shards.reader import Frames, Shard, open_shards
 from shards.schema import ROW_TYPES, ClipRow
-from shards.splits import SplitRule
+from shards.splits import ObjectSplits, SplitRule
 
 __all__ = ["Finding", "ShardReport", "verify_dataset", "verify_shard"]
 
-Progress = Callable[[int, int], None]  # clips done, clips in all
+Progress = Callable[[int, int, int], None]  # number of the shard, its clips done, its clips in all
 _BLOCK = 1 << 22
 
 
@@ -50,17 +51,25 @@ class ShardReport:
         return not self.findings
 
 
-def verify_dataset(url: str | Path) -> Iterator[ShardReport]:
-    """The report of every finished shard, in order. Raises ShardError when the dataset cannot be opened."""
-    dataset: Dataset = open_dataset(url)
-    for shard in dataset.shards:
-        yield verify_shard(shard, split_rule=dataset.record.split_rule)
+def verify_dataset(url: str | Path, *, progress: Progress | None = None) -> Iterator[ShardReport]:
+    """The report of every finished shard of a dataset, in order, or of the one shard that `url` is.
+
+    Splits are held against the rule of the dataset that a shard lies in. ShardError when nothing can be opened.
+    """
+    splits = ObjectSplits()
+    for shard in open_shards(url):
+        of_shard = partial(progress, shard.record.shard) if progress else None
+        report = verify_shard(shard, split_rule=shard.read_split_rule(), progress=of_shard)
+        yield replace(report, findings=(*report.findings, *_split_findings(shard, splits)))
 
 
 def verify_shard(
-    shard: Shard, *, split_rule: SplitRule | None, progress: Progress | None = None
+    shard: Shard, *, split_rule: SplitRule | None, progress: Callable[[int, int], None] | None = None
 ) -> ShardReport:
-    """Check everything about one shard; `split_rule` None leaves the splits unchecked."""
+    """Check everything about one shard; `split_rule` None: splits are not held against a rule.
+
+    `progress` gets clips done and clips in all.
+    """
     findings = list(_file_findings(shard))
     n_frames = 0
     if not findings:  # damaged files are reported once, not again by every row
@@ -137,7 +146,7 @@ def _object_findings(shard: Shard) -> list[Finding]:
 
 
 def _clips_findings(
-    shard: Shard, split_rule: SplitRule | None, progress: Progress | None
+    shard: Shard, split_rule: SplitRule | None, progress: Callable[[int, int], None] | None
 ) -> Iterator[tuple[list[Finding], int]]:
     """Findings and number of frames of each clip."""
     clips = shard.clips()
@@ -155,6 +164,19 @@ def _clips_findings(
         yield [_finding(shard, problem, f"clip {clip.clip_id}") for problem in problems], len(frames)
     if progress:
         progress(len(clips), len(clips))
+
+
+def _split_findings(shard: Shard, splits: ObjectSplits) -> Iterator[Finding]:
+    """Objects that an earlier clip or shard has in another split; once each."""
+    try:
+        clips = shard.read_clips(["object_uid", "split"])
+    except ShardError:  # damage, which is reported already
+        return
+    for uid, split in dict.fromkeys(zip(clips["object_uid"], clips["split"])):
+        try:
+            splits.add(uid, split, where=shard.path)
+        except SplitError as error:
+            yield _finding(shard, error.problem)
 
 
 def _frame_problems(frames: Frames, clip: ClipRow) -> list[str]:

@@ -23,18 +23,17 @@ from shards.errors import (
     ShardError,
     storage_error,
 )
-from shards.records import (
+from shards.schema import ROW_TYPES, SCHEMA_VERSION, ClipRow, FrameRow, ObjectRow
+from shards.storage.parquet import ParquetSource, file_metadata, file_record, local_source, parquet_writer
+from shards.storage.records import (
     DatasetRecord,
     MotionRecord,
     Provenance,
     ShardRecord,
-    fsync_dir,
-    fsync_file,
     parse_record,
     write_record,
 )
-from shards.schema import ROW_TYPES, SCHEMA_VERSION, ClipRow, FrameRow, ObjectRow
-from shards.storage.parquet import ParquetSource, file_metadata, file_record, local_source, parquet_writer
+from shards.storage.whole_file import fsync_dir, fsync_file
 
 __all__ = [
     "begin_dataset",
@@ -45,6 +44,7 @@ __all__ = [
     "shard_dir",
     "stage_motion",
     "stage_skipped_motion",
+    "staging_dir",
 ]
 
 
@@ -53,9 +53,14 @@ def shard_dir(dataset_dir: Path, shard: int) -> Path:
     return dataset_dir / "shards" / f"shard-{shard:05d}"
 
 
+def staging_dir(dataset_dir: Path, shard: int) -> Path:
+    """Where the finished motions of a shard wait for it to be committed."""
+    return dataset_dir / "staging" / f"shard-{shard:05d}"
+
+
 def motion_dir(dataset_dir: Path, shard: int, motion_index: int) -> Path:
-    """Where a finished motion waits for its shard to be committed."""
-    return dataset_dir / "staging" / f"shard-{shard:05d}" / f"motion-{motion_index:06d}"
+    """One of those motions."""
+    return staging_dir(dataset_dir, shard) / f"motion-{motion_index:06d}"
 
 
 def begin_dataset(dataset_dir: Path, record: DatasetRecord) -> None:
@@ -156,7 +161,7 @@ def commit_shard(
     is not what was written, DiskFullError or StorageError; staged motions are kept in every case.
     """
     final = shard_dir(dataset_dir, shard)
-    staging = motion_dir(dataset_dir, shard, 0).parent
+    staging = staging_dir(dataset_dir, shard)
     if is_shard_committed(dataset_dir, shard):
         record = parse_record(
             (final / "shard.json").read_bytes(), ShardRecord, where=str(final / "shard.json")

@@ -28,7 +28,7 @@ REDISTRIBUTABLE = ("CC0-1.0", "CC-BY-3.0", "CC-BY-4.0", "Apache-2.0", "MIT", "BS
 
 @dataclass(frozen=True, kw_only=True)
 class ShardConfig:
-    """How arrays are stored (metrics: DECISIONS.md)."""
+    """How arrays are stored (DECISIONS D1, D3)."""
 
     depth_compression: Literal["pxr24", "zip"]
     rgb_codec: Literal["png", "jpeg", "webp"]  # png needs nothing to read; the others need Pillow

@@ -1,11 +1,11 @@
 """PNG files as Blender writes them, checked and without the times Cycles notes in them."""
 
-import os
 import struct
 import zlib
 from pathlib import Path
 
 from datagen.blender.log import RenderError
+from shards.storage.whole_file import write_whole
 
 __all__ = ["finish_image"]
 
@@ -22,9 +22,8 @@ def finish_image(partial: Path, final: Path) -> None:
     kept = _kept_chunks(partial.read_bytes() if partial.is_file() else b"")
     if kept is None:
         raise RenderError(f"{partial}: Blender wrote no complete image; is the disk full?")
-    stripped = partial.with_suffix(".stripped")
-    stripped.write_bytes(kept)
-    os.replace(stripped, final)
+    with write_whole(final) as stripped:
+        stripped.write_bytes(kept)
     partial.unlink()
 
 

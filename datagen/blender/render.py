@@ -1,7 +1,6 @@
 """Render every image of a Scene, resumably, and report each one."""
 
 import hashlib
-import os
 import resource
 import sys
 import time
@@ -16,10 +15,12 @@ from datagen.blender.devices import DeviceRequest, select_device
 from datagen.blender.log import BlenderLog, ProgressChannel, RenderError
 from datagen.blender.png import finish_image
 from datagen.blender.settings import apply_settings, sampling_seed
+from datagen.scene.frame_files import FRAME_PATTERN, frame_path
 from datagen.scene.scene import Scene
 from datagen.scene.scene_file import scene_sha256
+from shards.storage.whole_file import write_whole
 
-__all__ = ["Image", "frame_path", "render_scene", "resume_key"]
+__all__ = ["Image", "render_scene", "resume_key"]
 
 _KEY_FILE = "images.sha256"
 
@@ -33,11 +34,6 @@ class Image:
     path: Path
 
 
-def frame_path(frames_dir: Path, camera: int, frame: int) -> Path:
-    """Where the image of one camera and frame is written: cam-03/frame-0007.png."""
-    return frames_dir / f"cam-{camera:02d}" / f"frame-{frame:04d}.png"
-
-
 def render_scene(
     scene: Scene,
     frames_dir: Path,
@@ -49,8 +45,7 @@ def render_scene(
 ) -> None:
     """Write all images that are not there yet, frames outer and cameras inner.
 
-    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop (metrics in
-    DECISIONS.md).
+    Cameras share the posed meshes and the BVH of a frame, so they are the inner loop (DECISIONS D81).
     Raises DeviceError, TextureError, RenderError.
     """
     started = time.perf_counter()
@@ -117,11 +112,10 @@ def _missing_images(scene: Scene, frames_dir: Path, key: str) -> list[Image]:
     key_file = frames_dir / _KEY_FILE
     if not key_file.is_file() or key_file.read_text() != key:
         key_file.unlink(missing_ok=True)
-        for stale in frames_dir.glob("cam-*/frame-*.png"):
+        for stale in frames_dir.glob(FRAME_PATTERN):
             stale.unlink()
-        partial = key_file.with_suffix(".partial")
-        partial.write_text(key)
-        os.replace(partial, key_file)
+        with write_whole(key_file) as partial:
+            partial.write_text(key)
     images = [
         Image(camera=camera, frame=frame, path=frame_path(frames_dir, camera, frame))
         for frame in range(len(scene.T_world_from_obj))

@@ -1,4 +1,4 @@
-"""Cycles settings: those the Scene decides, and those chosen once by measurement (DECISIONS.md)."""
+"""Cycles settings: those the Scene decides, and those chosen once by measurement (DECISIONS D82, D83)."""
 
 import hashlib
 

@@ -1,10 +1,10 @@
-"""System libraries that Blender's Python module links to, and the Debian packages that hold them."""
+"""Does Blender's Python module load here? If not: what to install, down to the Debian packages."""
 
 import ctypes
 import re
 import sys
 
-__all__ = ["blender_import_problem", "missing_packages", "packages_of"]
+__all__ = ["blender_import_problem", "check_blender", "missing_packages", "packages_of"]
 
 # bpy opens windows nowhere in this project, but it is linked against the window system.
 DEBIAN_PACKAGE_OF = {
@@ -42,19 +42,47 @@ def packages_of(message: str) -> list[str]:
 
 
 def blender_import_problem() -> str | None:
-    """Why `import bpy` fails here and what to do about it; None when it works."""
+    """Why `import bpy` fails here and what to do about it, in one line; None when it works."""
     packages = missing_packages()
     if not packages:
         try:
             import bpy  # noqa: F401
+        except ModuleNotFoundError:
+            return _no_module()
         except ImportError as error:
             packages = packages_of(str(error))
             if not packages:
-                fix = "Install it with: pip install 'bpy==4.5.*' (Python 3.11)"
-                return f"Blender's module does not load: {error}\n{fix}"
+                return f"Blender's module does not load: {error}; install it anew: pip install --force-reinstall bpy"
         else:
             return None
     return (
-        "Blender's module needs system libraries that are missing.\n"
-        f"Install them with: apt-get install --no-install-recommends {' '.join(packages)}"
+        "Blender's module needs system libraries that are missing; install them with: "
+        f"apt-get install --no-install-recommends {' '.join(packages)}"
     )
+
+
+def _no_module() -> str:
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    if version != "3.11":
+        return (
+            f"Blender's module exists for Python 3.11 only, this is {version}; make the environment with 3.11"
+        )
+    return (
+        "Blender's module is not installed; expected the extra 'datagen': pip install 'forehoi-open[datagen]'"
+    )
+
+
+def check_blender() -> int:
+    """Print Blender's version and devices, or what to install; the exit status, 0 or 2."""
+    problem = blender_import_problem()
+    if problem is not None:
+        sys.stderr.write(f"{problem}\n")
+        return 2
+    import bpy
+
+    from datagen.blender.devices import found_devices
+
+    sys.stdout.write(f"bpy {bpy.app.version_string}\n")
+    for backend, names in found_devices().items():
+        sys.stdout.write(f"{backend.lower()}: {', '.join(names)}\n")
+    return 0

@@ -9,6 +9,7 @@ import click
 import numpy as np
 from rich.console import Console
 
+from datagen.cli.count_progress import CountProgress
 from datagen.cli.options import (
     config_option,
     default_out,
@@ -17,7 +18,6 @@ from datagen.cli.options import (
     plain_errors,
     workers_option,
 )
-from datagen.cli.selection_progress import SelectionProgress
 from datagen.config import DatasetConfig, load_config
 from datagen.grasps.recorded.graspxl import SequenceFile, read_sequence
 from datagen.grasps.recorded.replay import ReplayError, replay
@@ -28,7 +28,7 @@ from datagen.hands.model import ShapedHand, shape_hand
 from datagen.input_error import InputError
 from datagen.inspection.grasp_table import grasp_table
 from datagen.inspection.inventory import asset_states
-from datagen.inspection.inventory_table import asset_table
+from datagen.inspection.inventory_table import asset_lines
 from datagen.inspection.replay_table import replay_table
 from datagen.inspection.selection_table import selection_lines, selection_table
 from datagen.jobs.select_motions import SELECTION_FILE, select_motions
@@ -46,14 +46,15 @@ __all__ = ["assets", "grasps", "select"]
 @click.command()
 @config_option
 @plain_errors
-def assets(config_path: Path) -> None:
+def assets(config_name: str) -> None:
     """List every open and licensed input: whether it is there, its version and licence, how to get it.
 
     \b
     Example:
-      datagen assets --config configs/datagen/graspxl.yaml
+      datagen assets --config graspxl
     """
-    Console().print(asset_table(asset_states(load_config(config_path))))
+    console = Console()
+    console.print(asset_lines(asset_states(load_config(config_name)), console.width), soft_wrap=True)
 
 
 @click.command()
@@ -62,16 +63,16 @@ def assets(config_path: Path) -> None:
 @license_option
 @workers_option
 @plain_errors
-def select(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
+def select(config_name: str, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
     """Decide which motions are worth rendering; print how many each rule removes, write the reasons.
 
     \b
     Example:
-      datagen select --config configs/datagen/small.yaml --license-allow cc0,by
+      datagen select --config small --license-allow cc0,by
     """
-    config = load_config(config_path, licence_allow=licence_allow)
-    out = out or default_out(config_path)
-    with SelectionProgress() as bar:
+    config = load_config(config_name, licence_allow=licence_allow)
+    out = out or default_out(config_name)
+    with CountProgress("looking at objects") as bar:
         selection = select_motions(config, out, workers=workers, report=bar.update)
     console = Console()
     console.print(selection_table(selection.decisions))
@@ -92,15 +93,15 @@ def select(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] |
     help="Motions per object.  [default: 1 simulated, or all recorded]",
 )
 @plain_errors
-def grasps(config_path: Path, objects: tuple[str, ...], motions: int | None) -> None:
+def grasps(config_name: str, objects: tuple[str, ...], motions: int | None) -> None:
     """Simulate or replay grasps without rendering; print success, contact distances and quality.
 
     \b
     Example:
       datagen grasps --object starter/milk --motions 3
     """
-    config = load_config(config_path)
-    with SelectionProgress("grasping") as bar:
+    config = load_config(config_name)
+    with CountProgress("grasping") as bar:
         if config.motions.source == "simulated":
             table = grasp_table(_simulated(config, objects, motions or 1, bar))
         else:
@@ -109,7 +110,7 @@ def grasps(config_path: Path, objects: tuple[str, ...], motions: int | None) -> 
 
 
 def _simulated(
-    config: DatasetConfig, objects: tuple[str, ...], motions: int, bar: SelectionProgress
+    config: DatasetConfig, objects: tuple[str, ...], motions: int, bar: CountProgress
 ) -> GraspReport:
     library = open_library(config.objects, config.motions)
     uids = objects or tuple(uid for uid in library.uids() if uid not in config.objects.exclude)
@@ -125,7 +126,7 @@ def _simulated(
 
 
 def _replayed(
-    config: DatasetConfig, objects: tuple[str, ...], motions: int | None, bar: SelectionProgress
+    config: DatasetConfig, objects: tuple[str, ...], motions: int | None, bar: CountProgress
 ) -> list[ReplayOutcome]:
     of_object: dict[str, list[SequenceFile]] = {}
     for file in recorded_sequences(config.motions).values():

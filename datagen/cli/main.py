@@ -1,14 +1,13 @@
 """The `datagen` command: parse, call, print. Everything else lives in the modules it calls."""
 
-import functools
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import click
 from rich.console import Console
-from rich.progress import Progress, TaskID
 
+from datagen.cli.config_command import config_command
+from datagen.cli.count_progress import CountProgress
 from datagen.cli.input_commands import assets, grasps, select
 from datagen.cli.options import (
     config_option,
@@ -19,19 +18,18 @@ from datagen.cli.options import (
     workers_option,
 )
 from datagen.cli.render_progress import RenderProgress
-from datagen.cli.selection_progress import SelectionProgress
 from datagen.config import load_config
 from datagen.inspection.plan_table import plan_table
 from datagen.inspection.selection_table import selection_lines
 from datagen.inspection.sheet import contact_sheet, write_png
-from datagen.inspection.summary import shard_line, shard_summary
+from datagen.inspection.summary import report_lines, shard_line, shard_summary
 from datagen.inspection.video import write_video
 from datagen.jobs.plan_dataset import plan_dataset
 from datagen.jobs.render_shard import RenderOptions, render_shard
 from datagen.jobs.select_motions import Selection
-from shards.errors import ShardError
-from shards.reader import Shard, open_dataset, open_shard
-from shards.verify import ShardReport, verify_shard
+from shards.reader import Shard, open_shard
+from shards.verify import verify_dataset
+from shards.writer import shard_dir
 
 __all__ = ["main"]
 
@@ -48,7 +46,7 @@ def main() -> None:
     """
 
 
-for command in (select, grasps, assets):
+for command in (config_command, select, grasps, assets):
     main.add_command(command)
 
 
@@ -58,16 +56,16 @@ for command in (select, grasps, assets):
 @license_option
 @workers_option
 @plain_errors
-def plan(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
+def plan(config_name: str, out: Path | None, licence_allow: tuple[str, ...] | None, workers: int) -> None:
     """Decide what to render: write dataset.json, selection.parquet and plan.parquet.
 
     \b
     Example:
-      datagen plan --config configs/datagen/paper.yaml --out data/paper
+      datagen plan --config paper --out data/paper
     """
-    config = load_config(config_path, licence_allow=licence_allow)
-    out = out or default_out(config_path)
-    with SelectionProgress() as bar:
+    config = load_config(config_name, licence_allow=licence_allow)
+    out = out or default_out(config_name)
+    with CountProgress("looking at objects") as bar:
         made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
     _say_selection(selection)
     Console().print(plan_table(made, out))
@@ -91,7 +89,7 @@ def plan(config_path: Path, out: Path | None, licence_allow: tuple[str, ...] | N
 @license_option
 @plain_errors
 def render(
-    config_path: Path,
+    config_name: str,
     out: Path | None,
     shard: int,
     device: str,
@@ -103,18 +101,18 @@ def render(
 
     \b
     Example:
-      datagen render --config configs/datagen/tiny.yaml --shard 0
+      datagen render --config tiny --shard 0
     """
-    config = load_config(config_path, licence_allow=licence_allow)
-    out = out or default_out(config_path)
-    with SelectionProgress() as bar:
+    config = load_config(config_name, licence_allow=licence_allow)
+    out = out or default_out(config_name)
+    with CountProgress("looking at objects") as bar:
         made, selection = plan_dataset(config, out, workers=workers, report=bar.update)
     _say_selection(selection)
     options = RenderOptions(
         device=device, workers=workers, threads_per_worker=threads, licence_allow=licence_allow
     )
     with RenderProgress(made.shard(shard)) as progress:
-        record = render_shard(config_path, config, made, out, shard, options, progress.update)
+        record = render_shard(config_name, config, made, out, shard, options, progress.update)
     click.echo(shard_line(record, out))
     click.echo(f"look at it: datagen inspect shard {shard} --out {out} --sheet sheet.png")
 
@@ -187,15 +185,14 @@ def verify(path: Path) -> None:
       datagen verify data/tiny
     """
     bad = 0
-    for report in _verified(path):
-        state = "ok" if report.ok else f"{len(report.findings)} findings"
-        click.echo(
-            f"{report.path}: {report.n_objects} objects, {report.n_clips} clips, {report.n_frames} frames, "
-            f"{report.n_bytes / 1e6:.1f} MB, {len(report.skipped)} motions skipped: {state}"
+    with CountProgress("verifying") as bar:
+        reports = verify_dataset(
+            path, progress=lambda shard, done, total: bar.update(done, total, f"verifying shard {shard}")
         )
-        for finding in report.findings:
-            click.echo(f"  {finding}")
-        bad += not report.ok
+        for report in reports:
+            for line in report_lines(report):
+                bar.print(line)
+            bad += not report.ok
     sys.exit(1 if bad else 0)
 
 
@@ -207,26 +204,4 @@ def _say_selection(selection: Selection | None) -> None:
 
 
 def _open(shard: str, out: Path) -> Shard:
-    return open_shard(out / "shards" / f"shard-{int(shard):05d}" if shard.isdecimal() else shard)
-
-
-def _show_progress(bar: Progress, task: TaskID, done: int, total: int) -> None:
-    bar.update(task, completed=done, total=total)
-
-
-def _verified(path: Path) -> Iterator[ShardReport]:
-    """Reports of a whole dataset or of one shard of it, with a bar on standard error."""
-    is_shard = (path / "shard.json").exists()
-    rule = None if is_shard else open_dataset(path).record.split_rule
-    shards = [open_shard(path)] if is_shard else open_dataset(path).shards
-    if not shards:
-        raise ShardError("no finished shard", where=str(path), fix="render one: datagen render --shard 0")
-    console = Console(stderr=True)
-    for shard in shards:
-        with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-            task = bar.add_task(f"verifying shard {shard.record.shard}", total=None)
-            yield verify_shard(
-                shard,
-                split_rule=rule,
-                progress=functools.partial(_show_progress, bar, task),
-            )
+    return open_shard(shard_dir(out, int(shard)) if shard.isdecimal() else shard)

@@ -8,24 +8,24 @@ from datagen.input_error import InputError
 from datagen.jobs.render_shard import PipelineError
 from datagen.objects.catalogue.licences import spdx_of
 from datagen.plan.plan import PlanError
+from shards.commands.plain_errors import plain_errors as plain_errors_of
 from shards.errors import ShardError
-from shards.plain_errors import plain_errors as plain_errors_of
 from shards.settings import SettingsError
 
 __all__ = ["config_option", "default_out", "license_option", "out_option", "plain_errors", "workers_option"]
 
 USER_ERRORS = (SettingsError, PlanError, PipelineError, InputError, ShardError)
-DEFAULT_CONFIG = Path("configs/datagen/tiny.yaml")
+DEFAULT_CONFIG = "tiny"
 
 plain_errors = plain_errors_of("datagen", dict.fromkeys(USER_ERRORS, 2))
 
 config_option = click.option(
     "--config",
-    "config_path",
-    type=click.Path(path_type=Path, dir_okay=False),
+    "config_name",
+    metavar="NAME|FILE",
     default=DEFAULT_CONFIG,
     show_default=True,
-    help="Complete YAML configuration.",
+    help="Preset, or YAML file of your own (`datagen config` prints them).",
 )
 out_option = click.option(
     "--out",
@@ -66,6 +66,6 @@ license_option = click.option(
 )
 
 
-def default_out(config_path: Path) -> Path:
+def default_out(config_name: str) -> Path:
     """Where the Makefile puts it too."""
-    return Path("data") / config_path.stem
+    return Path("data") / Path(config_name).stem

@@ -1,0 +1,1 @@
+"""Exact ray casting, shared by sampling and annotation."""

@@ -1,0 +1,1 @@
+"""Motions of one hand and one object before anything is drawn: simulated, or recorded and replayed."""

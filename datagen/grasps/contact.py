@@ -4,7 +4,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.grasps.object_surface import ObjectSurface, verts_in_object
-from datagen.hands.model import DIGITS, JOINT_NAMES, HandModel
+from datagen.hands.model import HandModel
+from shards.joints import DIGITS, MANO_JOINTS
 
 __all__ = ["TOUCHING_M", "digit_distances", "digit_of_vertex", "digits_touching", "signed_distances"]
 
@@ -13,7 +14,7 @@ TOUCHING_M = 0.005  # a digit whose skin comes this near the surface touches it
 
 def digit_of_vertex(model: HandModel) -> Int[np.ndarray, " vert"]:
     """Number in DIGITS of the digit that moves each vertex most; -1 on palm and wrist."""
-    digit_of_joint = np.array([-1, *(DIGITS.index(name[:-1]) for name in JOINT_NAMES[1:])])
+    digit_of_joint = np.array([-1, *(DIGITS.index(name[:-1]) for name in MANO_JOINTS[1:])])
     return digit_of_joint[model.weights.argmax(axis=1)]
 
 

@@ -15,12 +15,10 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from datagen.hands.model import ShapedHand
+from shards.joints import DIGIT_JOINTS, DIGITS, Digit
 
 __all__ = [
-    "DIGITS",
-    "DIGIT_BONES",
     "BoneHull",
-    "Digit",
     "HandBody",
     "Hinge",
     "Pad",
@@ -29,15 +27,6 @@ __all__ = [
     "local_rotations",
 ]
 
-Digit = Literal["thumb", "index", "middle", "ring", "pinky"]
-DIGITS: tuple[Digit, ...] = ("thumb", "index", "middle", "ring", "pinky")
-DIGIT_BONES: dict[Digit, tuple[int, int, int]] = {
-    "thumb": (13, 14, 15),
-    "index": (1, 2, 3),
-    "middle": (4, 5, 6),
-    "ring": (10, 11, 12),
-    "pinky": (7, 8, 9),
-}
 # Finger strength relative to the index (grip dynamometer studies: ring 0.9, little 0.7).
 STRENGTH = {"index": 1.0, "middle": 1.0, "ring": 0.9, "pinky": 0.7}
 
@@ -105,7 +94,7 @@ def build_hand_body(hand: ShapedHand) -> HandBody:
     hinges: list[Hinge] = []
     pads = []
     for digit, tip in zip(DIGITS, tips):
-        bones = DIGIT_BONES[digit]
+        bones = DIGIT_JOINTS[digit]
         if digit == "thumb":
             axis = _thumb_flexion_axis(verts, weights, joints, tip, radial, distal)
             hinges += _thumb_hinges(axis, distal, dorsal, joints, tip)
@@ -171,7 +160,7 @@ def _finger_hinges(digit: Digit, axis: Float[np.ndarray, "3"], dorsal: Float[np.
         Hinge(
             name=f"{digit}_{name}",
             digit=digit,
-            bone=DIGIT_BONES[digit][link],
+            bone=DIGIT_JOINTS[digit][link],
             role=role,  # type: ignore[arg-type]
             axis_bone=about,
             low_rad=float(low),
@@ -229,7 +218,7 @@ def _pad(
     joints: Float[np.ndarray, "16 3"],
     tip: Float[np.ndarray, "3"],
 ) -> Pad:
-    bone = DIGIT_BONES[digit][2]
+    bone = DIGIT_JOINTS[digit][2]
     along = unit(tip - joints[bone])
     palmar = unit(np.cross(axis, along))
     reach = (verts - joints[bone]) @ along / ((tip - joints[bone]) @ along)

@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import sparse
 
-from datagen.hands.model import DIGITS, JOINT_NAMES, PARENTS, HandModel, load_open_hand
+from datagen.hands.model import PARENTS, HandModel, load_open_hand
 from datagen.hands.skin_transfer import transferred_corner_uv
 from datagen.input_error import InputError
 from datagen.restricted_pickle import load_restricted_pickle
+from shards.joints import DIGIT_JOINTS, DIGITS
 
 __all__ = ["find_mano", "load_mano"]
 
@@ -168,7 +169,7 @@ def _faces(path: Path, side: Side, data: dict[Any, Any], n_verts: int) -> Int[np
 
 def _check_side(path: Path, side: Side, joints: Float[np.ndarray, "16 3"]) -> None:
     """Right hands point to -x from the wrist, left hands to +x, in metres."""
-    reach = joints[JOINT_NAMES.index("middle1")] - joints[0]
+    reach = joints[DIGIT_JOINTS["middle"][0]] - joints[0]
     length = float(np.linalg.norm(reach))
     if not _REACH_M[0] < length < _REACH_M[1]:
         found = f"v_template and J_regressor put the middle knuckle {length:.4g} from the wrist"
@@ -216,7 +217,7 @@ def _tip_ids(
 ) -> Int[np.ndarray, "5"]:
     """Thumb to pinky. The published vertices on MANO's own mesh, else the farthest along each last bone."""
     bone = weights.argmax(axis=1)
-    last = [JOINT_NAMES.index(f"{digit}3") for digit in DIGITS]
+    last = [DIGIT_JOINTS[digit][2] for digit in DIGITS]
     if len(v_template) == _N_OFFICIAL_VERTS and bone[list(_OFFICIAL_TIPS)].tolist() == last:
         return np.array(_OFFICIAL_TIPS)
     tips = []

@@ -15,8 +15,6 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 __all__ = [
-    "DIGITS",
-    "JOINT_NAMES",
     "PARENTS",
     "HandModel",
     "PosedHand",
@@ -28,12 +26,7 @@ __all__ = [
     "shape_hand",
 ]
 
-DIGITS = ("thumb", "index", "middle", "ring", "pinky")  # order of tips everywhere
-JOINT_NAMES = (
-    "wrist",
-    *(f"{digit}{k}" for digit in ("index", "middle", "pinky", "ring", "thumb") for k in (1, 2, 3)),
-)
-PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)
+PARENTS = (-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14)  # of MANO_JOINTS
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

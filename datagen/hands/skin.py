@@ -17,7 +17,6 @@ __all__ = [
     "load_open_skin",
     "nearest_texels",
     "open_nail_mask_png",
-    "open_skin_height_png",
     "sample_skin_coefficients",
 ]
 
@@ -79,12 +78,13 @@ def sample_skin_coefficients(rng: np.random.Generator, basis: SkinBasis) -> Floa
     """A plausible skin, tones spread evenly from the darkest to the lightest anchor.
 
     Two anchors from opposite halves of the tone axis (coefficient 0) are mixed, up to 8 % beyond
-    either end, and the other axes get a little variation of their own. Without anchors: N(0, 1)
-    clipped to two standard deviations, as users of the HTML model draw it.
+    either end, and the other axes get a little variation of their own. Without anchors (HTML): N(0, 1)
+    clipped to two standard deviations. Users of the HTML model draw twice that (FORMATS 3.3); whether one
+    unit of its coefficients is a standard deviation is not published, so draws stay where it certainly holds.
     """
     n = basis.basis.shape[1]
     if len(basis.anchors) == 0:
-        return np.clip(rng.standard_normal(n), -2.0, 2.0)
+        return np.clip(rng.standard_normal(n), -_MAX_COEFFICIENT, _MAX_COEFFICIENT)
     tone = basis.anchors[:, 0]
     dark, light = basis.anchors[tone < np.median(tone)], basis.anchors[tone >= np.median(tone)]
     a, b = dark[rng.integers(len(dark))], light[rng.integers(len(light))]
@@ -121,15 +121,6 @@ def load_open_skin() -> SkinBasis:
 def open_nail_mask_png() -> bytes:
     """White on the nails, in the open hand's UV layout."""
     return (_DATA / "nails.png").read_bytes()
-
-
-def open_skin_height_png() -> bytes:
-    """Relief of the skin in the open hand's UV layout, 8-bit grey; 128 is the smooth surface.
-
-    Creases, knuckles and wrinkles are low, nails stand out of a groove. Black to white is meant as
-    about one millimetre.
-    """
-    return (_DATA / "height.png").read_bytes()
 
 
 def _image(name: str, size: int) -> UInt8[np.ndarray, "row column 3"]:

@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from datagen.hands.arm import wrist_cap
-from datagen.hands.model import DIGITS, JOINT_NAMES, HandModel
+from datagen.hands.model import HandModel
+from shards.joints import DIGIT_JOINTS, DIGITS
 
 __all__ = ["transferred_corner_uv"]
 
@@ -23,7 +24,7 @@ _NORMAL_M = 0.015  # opposite sides of a finger count as this much further apart
 _N_CLOSEST = 8  # triangles, by their centres, on which the closest point is sought
 _MAX_RINGS = 6
 _TIE = 1e-6  # of a squared distance from the start: micrometres
-_PALM = [JOINT_NAMES.index("wrist"), *(JOINT_NAMES.index(f"{digit}1") for digit in DIGITS)]
+_PALM = [0, *(DIGIT_JOINTS[digit][0] for digit in DIGITS)]
 
 
 def transferred_corner_uv(source: HandModel, target: HandModel) -> Float[np.ndarray, "face 3 2"]:
@@ -54,7 +55,7 @@ def _verts_in_proportions_of(source: HandModel, target: HandModel) -> Float[np.n
     moves = np.empty((16, 3, 4))
     moves[0] = _similarity(joints[_PALM], goals[_PALM])
     for d, digit in enumerate(DIGITS):
-        chain = [JOINT_NAMES.index(f"{digit}{k}") for k in (1, 2, 3)] + [16 + d]
+        chain = [*DIGIT_JOINTS[digit], 16 + d]
         for joint, child in pairwise(chain):
             moves[joint] = _bone_similarity(joints[[joint, child]], goals[[joint, child]])
     homogeneous = np.concatenate([source.v_template, np.ones((len(source.v_template), 1))], axis=1)
@@ -87,9 +88,7 @@ def _bone_similarity(
 def _face_part(model: HandModel, faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, " face"]:
     """What moves each face most: 0 the palm, 1 .. 5 the digits."""
     weights = model.weights[faces].sum(axis=1)
-    digits = [
-        weights[:, [JOINT_NAMES.index(f"{digit}{k}") for k in (1, 2, 3)]].sum(axis=1) for digit in DIGITS
-    ]
+    digits = [weights[:, list(DIGIT_JOINTS[digit])].sum(axis=1) for digit in DIGITS]
     return np.argmax(np.stack([weights[:, 0], *digits], axis=1), axis=1)
 
 

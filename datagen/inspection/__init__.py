@@ -1,0 +1,1 @@
+"""What goes in and what came out, for people: tables, contact sheets, videos."""

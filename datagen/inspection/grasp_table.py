@@ -1,27 +1,36 @@
 """How well the objects of a library can be grasped, as a table."""
 
-from rich.table import Table
-
 from datagen.grasps.synthesis.report import GraspReport, GraspReportRow
+from datagen.inspection.fitting_table import FittingTable, TableColumn
 
 __all__ = ["grasp_table"]
 
+# In the order of `_cells`; what matters least first to go.
+_NUMBERS = (
+    ("kept", 0),
+    ("tries", 4),
+    ("depth mm", 1),
+    ("digits", 3),
+    ("slip mm", 2),
+    ("turned", 5),
+    ("s", 6),
+)
 
-COLUMNS = ("object", "kept", "tries", "depth mm", "digits", "slip mm", "turned", "s")
 
-
-def grasp_table(report: GraspReport) -> Table:
+def grasp_table(report: GraspReport) -> FittingTable:
     """One row per object and one of all; metrics are medians over kept motions, seconds of CPU per kept motion."""
-    table = Table(title="grasps", title_justify="left")
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column == "object" else "right")
+    failed = ", ".join(f"{reason} {count}" for reason, count in report.total.failures.items())
+    notes = [
+        f"{report.objects_kept_share:.0%} of objects with a kept grasp; slip: in the lift / while turned",
+        f"failed attempts: {failed or 'none'}",
+    ]
+    columns = [TableColumn(name="object")]
+    columns += [TableColumn(name=name, rank=rank, is_number=True) for name, rank in _NUMBERS]
+    table = FittingTable("grasps", columns, notes=notes)
     for row in report.rows:
         table.add_row(*_cells(row))
     table.add_section()
     table.add_row(*_cells(report.total))
-    failed = ", ".join(f"{reason} {count}" for reason, count in report.total.failures.items())
-    kept = f"{report.objects_kept_share:.0%} of objects with a kept grasp"
-    table.caption = f"{kept}; slip in lift/turn. Failed attempts: {failed or 'none'}"
     return table
 
 

@@ -1,26 +1,46 @@
-"""The inputs of the generator as one table."""
+"""The inputs of the generator, one block of lines each."""
 
+import textwrap
 from collections.abc import Sequence
 
-from rich.table import Table
+from rich.text import Text
 
 from datagen.inspection.inventory import AssetState
 
-__all__ = ["asset_table"]
+__all__ = ["asset_lines"]
 
-MARKS = {"present": "[green]present[/]", "missing": "[yellow]missing[/]", "wrong": "[red]wrong[/]"}
+_COLORS = {"present": "green", "missing": "yellow", "wrong": "red"}
+_LABEL = 11  # columns before a value
 
 
-def asset_table(states: Sequence[AssetState]) -> Table:
-    """One row per input; readable at 80 columns."""
-    table = Table(title="inputs", title_justify="left", show_lines=True)
-    for column, share in (("input, licence", 2), ("state, version", 2), ("place, setting, how to get it", 4)):
-        table.add_column(column, overflow="fold", ratio=share)
+def asset_lines(states: Sequence[AssetState], width: int) -> Text:
+    """Name and state of every input, then licence, place, setting and how to get it.
+
+    No line is longer than `width`, but for a path, which is never broken: it can be copied.
+    """
+    name_width = max(len(state.name) for state in states) + 2
+    text = Text()
     for state in states:
-        found = [MARKS[state.state], state.version, state.problem]
-        table.add_row(
-            f"{state.name}\n[dim]{state.licence}[/]",
-            "\n".join(line for line in found if line),
-            f"{state.place}\n[dim]{state.setting}[/]\n{state.how_to_get}",
-        )
-    return table
+        text.append(f"{state.name:{name_width}}", style="bold")
+        text.append(state.state, style=_COLORS[state.state])
+        text.append("\n")
+        for label, value in (
+            ("version", state.version),
+            ("problem", state.problem),
+            ("licence", state.licence),
+            ("place", state.place),
+            ("setting", state.setting),
+            ("to get it", "" if state.state == "present" else state.how_to_get),
+        ):
+            if value:
+                text.append_text(_labelled(label, value, width))
+    there = sum(state.state == "present" for state in states)
+    text.append(f"{there} of {len(states)} inputs are there; others are needed where a setting asks for them")
+    return text
+
+
+def _labelled(label: str, value: str, width: int) -> Text:
+    lines = textwrap.wrap(value, width - _LABEL - 2, break_long_words=False, break_on_hyphens=False)
+    text = Text(f"  {label:{_LABEL}}", style="dim")
+    text.append(f"\n{' ' * (_LABEL + 2)}".join(lines), style="not dim")
+    return text.append("\n")

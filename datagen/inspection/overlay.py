@@ -1,10 +1,13 @@
 """Labels drawn over an image: mask contours, projected joints, object axes."""
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from shards.geometry import project_points, transform_points
+from shards.joints import DIGIT_JOINTS, JOINTS
 from shards.storage.images import Masks
 
 __all__ = ["draw_labels"]
@@ -12,20 +15,10 @@ __all__ = ["draw_labels"]
 # RGB. Amodal contours are thin and pale, visible ones full; axes are x red, y green, z blue.
 OBJECT_COLOR, HAND_COLOR, ARM_COLOR = (255, 190, 40), (60, 200, 255), (150, 150, 160)
 BONES = [
-    (0, 1),
-    (1, 2),
-    (2, 3),
-    (3, 17),
-    (0, 4),
-    (4, 5),
-    (5, 6),
-    (6, 18),
-    (0, 10),
-    (10, 11),
-    (11, 12),
-    (12, 19),
+    bone
+    for digit in ("index", "middle", "ring", "pinky", "thumb")
+    for bone in pairwise((0, *DIGIT_JOINTS[digit], JOINTS.index(f"{digit}_tip")))
 ]
-BONES += [(0, 7), (7, 8), (8, 9), (9, 20), (0, 13), (13, 14), (14, 15), (15, 16)]
 DIGIT_COLORS = ((90, 220, 90), (220, 220, 80), (250, 150, 70), (230, 90, 200), (240, 70, 70))
 
 

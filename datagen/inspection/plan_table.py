@@ -3,19 +3,21 @@
 from collections import Counter
 from pathlib import Path
 
-from rich.table import Table
-
+from datagen.inspection.fitting_table import FittingTable, TableColumn
 from datagen.plan.plan import Plan
 from shards.splits import object_identity
 
 __all__ = ["plan_table"]
 
 
-def plan_table(plan: Plan, out: Path) -> Table:
+def plan_table(plan: Plan, out: Path) -> FittingTable:
     """Counts per split and in all; the cost is in pixels times samples, because machines differ."""
-    table = Table(title=f"plan of {out}", title_justify="left")
-    for column in ("split", "objects", "motions", "clips", "frames", "pixel samples"):
-        table.add_column(column, justify="left" if column == "split" else "right")
+    numbers = ("objects", "motions", "clips", "frames", "pixel samples")
+    table = FittingTable(
+        f"plan of {out}",
+        [TableColumn(name="split"), *(TableColumn(name=name, is_number=True) for name in numbers)],
+        notes=[f"{plan.n_shards:,} shards of up to {len(plan.shard(0))} motions"],
+    )
     splits = Counter(motion.split for motion in plan.motions)
     for split in (*sorted(splits), "all"):
         motions = [motion for motion in plan.motions if split in (motion.split, "all")]
@@ -27,5 +29,4 @@ def plan_table(plan: Plan, out: Path) -> Table:
             f"{sum(motion.n_cameras * motion.n_frames for motion in motions):,}",
             f"{sum(motion.cost_megapixel_samples for motion in motions) / 1e3:,.2f} G",
         )
-    table.caption = f"{plan.n_shards:,} shards of up to {max(len(plan.shard(0)), 1)} motions"
     return table

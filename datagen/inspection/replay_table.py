@@ -4,45 +4,41 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Float
-from rich import box
-from rich.table import Table
 
 from datagen.grasps.recorded.replay_report import ReplayOutcome
 from datagen.grasps.sequence import GraspSequence
+from datagen.inspection.fitting_table import FittingTable, TableColumn
 
 __all__ = ["replay_table"]
 
-COLUMNS = ("sequence", "held", "rise", "slip", "depth", "touch", "thumb index mid. ring pinky")
+# In the order of `_cells`, with the rank of each.
+_NUMBERS = (
+    ("held", 5), ("rise", 4), ("slip", 3), ("depth", 1), ("touch", 2), ("thumb index mid. ring pinky", 0),
+)  # fmt: skip
 
 
-def replay_table(outcomes: Sequence[ReplayOutcome]) -> Table:
+def replay_table(outcomes: Sequence[ReplayOutcome]) -> FittingTable:
     """One row per sequence, then medians; millimetres. Digits: distance to the object, negative inside."""
-    table = Table(
-        title="replayed motions (mm; held in s)",
-        title_justify="left",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-        show_edge=False,
-        pad_edge=False,
-    )
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column == "sequence" else "right", no_wrap=True)
     replayed = [(outcome, outcome.sequence) for outcome in outcomes if outcome.sequence is not None]
+    refused = [f"left out: {outcome.reason}" for outcome in outcomes if outcome.sequence is None]
+    notes = [f"{len(replayed)} of {len(outcomes)} replayed"]
+    if replayed:
+        hand = replayed[0][1]
+        if hand.stands_in_for:
+            notes.append(f"{hand.hand_model} stands in for {hand.stands_in_for}: contacts are approximate")
+        notes.append(f"{np.median([outcome.cpu_seconds for outcome, _ in replayed]):.1f} s of CPU per motion")
+    columns = [
+        TableColumn(name="sequence"),
+        *(TableColumn(name=name, is_number=True, rank=rank) for name, rank in _NUMBERS),
+    ]
+    table = FittingTable("replayed motions (mm; held in s)", columns, notes=[*notes, *refused])
     metrics = np.array([_metrics(sequence) for _, sequence in replayed]).reshape(-1, 10)
     for (outcome, _), row in zip(replayed, metrics):
         table.add_row(_short(outcome.sequence_id), *_cells(row))
-    lines = [f"{len(replayed)} of {len(outcomes)} replayed"]
     if replayed:
         table.add_section()
         for name, row in (("median", np.median(metrics, axis=0)), ("largest", metrics.max(axis=0))):
             table.add_row(name, *_cells(row))
-        hand = replayed[0][1]
-        if hand.stands_in_for:
-            lines.append(f"{hand.hand_model} stands in for {hand.stands_in_for}: contacts are approximate")
-        lines.append(f"{np.median([outcome.cpu_seconds for outcome, _ in replayed]):.1f} s of CPU per motion")
-    refused = [f"left out: {outcome.reason}" for outcome in outcomes if outcome.sequence is None]
-    table.caption = "\n".join([*lines, *refused])
-    table.caption_justify = "left"
     return table
 
 

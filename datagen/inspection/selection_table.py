@@ -2,27 +2,31 @@
 
 from collections.abc import Sequence
 
-from rich.table import Table
-
+from datagen.inspection.fitting_table import FittingTable, TableColumn
 from datagen.jobs.select_motions import Selection
 from datagen.plan.selection_rules import Decision, removed_by_rule
 
 __all__ = ["selection_lines", "selection_table"]
 
 
-def selection_table(decisions: Sequence[Decision]) -> Table:
-    """One row per rule, in the order in which they apply, and what is kept."""
-    table = Table(title="selection", title_justify="left")
-    for column in ("rule", "motions", "objects", "example"):
-        table.add_column(column, justify="right" if column in ("motions", "objects") else "left")
-    for rule, (motions, objects) in removed_by_rule(decisions).items():
-        first = next((decision for decision in decisions if decision.rule == rule.value), None)
-        example = "" if first is None else f"{first.sequence_id or first.object_uid}: {first.reason}"
-        table.add_row(rule.value, f"{motions:,}", f"{objects:,}", example)
+def selection_table(decisions: Sequence[Decision]) -> FittingTable:
+    """One row per rule, in the order in which they apply, and what is kept; below it the first case of each rule."""
+    removed = removed_by_rule(decisions)
+    firsts = {rule: next((d for d in decisions if d.rule == rule.value), None) for rule in removed}
+    examples = [
+        f"{rule.value}: {first.sequence_id or first.object_uid}: {first.reason}"
+        for rule, first in firsts.items()
+        if first is not None
+    ]
+    columns = [TableColumn(name="rule")]
+    columns += [TableColumn(name=name, is_number=True) for name in ("motions", "objects")]
+    table = FittingTable("selection", columns, notes=examples)
+    for rule, (motions, objects) in removed.items():
+        table.add_row(rule.value, f"{motions:,}", f"{objects:,}")
     table.add_section()
     kept = [decision for decision in decisions if decision.kept]
-    table.add_row("kept", f"{len(kept):,}", f"{len({d.object_uid for d in kept}):,}", "")
-    table.add_row("all", f"{len(decisions):,}", f"{len({d.object_uid for d in decisions}):,}", "")
+    for name, group in (("kept", kept), ("all", decisions)):
+        table.add_row(name, f"{len(group):,}", f"{len({decision.object_uid for decision in group}):,}")
     return table
 
 

@@ -25,15 +25,7 @@ def contact_sheet(
         clips[i]
         for i in np.unique(np.linspace(0, len(clips) - 1, min(n_clips, len(clips))).round().astype(int))
     ]
-    scale_m = dict(
-        zip(
-            *(
-                shard.read_objects(["object_uid", "object_scale_m"])[c]
-                for c in ("object_uid", "object_scale_m")
-            )
-        )
-    )
-    rows = [_clip_rows(shard, clip, float(scale_m[clip.object_uid]), n_frames, tile_px) for clip in chosen]
+    rows = [_clip_rows(shard, clip, n_frames, tile_px) for clip in chosen]
     return np.concatenate(rows, axis=0)
 
 
@@ -62,15 +54,14 @@ def write_png(path: Path, rgb: UInt8[np.ndarray, "height width 3"]) -> None:
 
 
 def _clip_rows(
-    shard: Shard, clip: ClipRow, object_scale_m: float, n_frames: int, tile_px: int
+    shard: Shard, clip: ClipRow, n_frames: int, tile_px: int
 ) -> UInt8[np.ndarray, "height width 3"]:
     frames = shard.read_frames(clip.clip_id, FRAME_COLUMNS)
+    axis_m = 0.5 * float(shard.read_object(clip.object_uid, ["object_scale_m"])["object_scale_m"][0])
     moments: list[int] = np.linspace(0, clip.n_frames - 1, n_frames).round().astype(int).tolist()
     zoom = max(1, round(2 * tile_px / clip.image_width))
     plain = [_tile(frames.rgb(i), tile_px) for i in moments]
-    labelled = [
-        _tile(labelled_frame(clip, frames, i, 0.5 * object_scale_m, zoom=zoom), tile_px) for i in moments
-    ]
+    labelled = [_tile(labelled_frame(clip, frames, i, axis_m, zoom=zoom), tile_px) for i in moments]
     image = np.concatenate([np.concatenate(plain, axis=1), np.concatenate(labelled, axis=1)], axis=0)
     caption = np.full((CAPTION_PX, image.shape[1], 3), 32, np.uint8)
     text = (

@@ -4,16 +4,16 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from rich.console import Group
-from rich.table import Table
 
+from datagen.inspection.fitting_table import FittingTable, TableColumn
 from shards.reader import ColumnTable, Shard
-from shards.records import ShardRecord
+from shards.storage.records import ShardRecord
+from shards.verify import ShardReport
 
-__all__ = ["shard_line", "shard_summary", "short_uid"]
+__all__ = ["report_lines", "shard_line", "shard_summary", "short_uid"]
 
 CLIP_COLUMNS = (
     "clip_id", "motion_index", "camera_kind", "object_uid", "split", "n_frames", "fps", "image_width",
@@ -31,23 +31,6 @@ OBJECT_COLUMNS = (
     "color_detail",
 )
 
-TEXT_COLUMNS = (
-    "",
-    "value",
-    "clip",
-    "camera",
-    "object",
-    "hand",
-    "licence",
-    "author",
-    "light",
-    "table",
-    "file",
-    "phase",
-    "reason",
-)
-
-
 _AUTHOR_CHARACTERS = 24  # names may be long; the shard holds them whole
 
 
@@ -58,6 +41,16 @@ def shard_line(record: ShardRecord, out: Path) -> str:
         f"shard {record.shard} in {out}: {len(record.clip_ids)} clips, {record.files['frames.parquet'].rows} frames, "
         f"{size:.1f} MB, {len(record.skipped)} motions skipped"
     )
+
+
+def report_lines(report: ShardReport) -> list[str]:
+    """What `datagen verify` says of a shard: one line, and one for each finding."""
+    state = "ok" if report.ok else f"{len(report.findings)} findings"
+    counts = (
+        f"{report.path}: {report.n_objects} objects, {report.n_clips} clips, {report.n_frames} frames, "
+        f"{report.n_bytes / 1e6:.1f} MB, {len(report.skipped)} motions skipped: {state}"
+    )
+    return [counts, *(f"  {finding}" for finding in report.findings)]
 
 
 def shard_summary(shard: Shard) -> Group:
@@ -71,19 +64,19 @@ def shard_summary(shard: Shard) -> Group:
     return Group(*parts)
 
 
-def _table(title: str, *columns: str) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in columns:
-        justify: Literal["left", "right"] = "left" if column in TEXT_COLUMNS else "right"
-        table.add_column(column, justify=justify, overflow="fold" if column == "object" else "ellipsis")
-    return table
+def _text(name: str, rank: int = 0, *, folds: bool = False) -> TableColumn:
+    return TableColumn(name=name, rank=rank, folds=folds)
 
 
-def _overview(shard: Shard, clips: ColumnTable) -> Table:
+def _number(name: str, rank: int = 0) -> TableColumn:
+    return TableColumn(name=name, rank=rank, is_number=True)
+
+
+def _overview(shard: Shard, clips: ColumnTable) -> FittingTable:
     record = shard.record
     sizes = sorted({f"{w} x {h}" for w, h in zip(clips["image_width"], clips["image_height"])})
     splits = Counter(clips["split"])
-    table = _table(f"shard {record.shard}: {shard.path}", "", "value")
+    table = FittingTable(f"shard {record.shard}: {shard.path}", [_text(""), _text("", folds=True)])
     for name, value in (
         ("schema version", record.schema_version),
         ("generator", record.provenance.generator_commit[:16]),
@@ -101,12 +94,14 @@ def _overview(shard: Shard, clips: ColumnTable) -> Table:
     return table
 
 
-def _objects(objects: ColumnTable, clips: ColumnTable) -> Table:
-    table = _table("objects", "object", "licence", "author", "longest", "texture", "detail", "clips")
+def _objects(objects: ColumnTable, clips: ColumnTable) -> FittingTable:
+    columns = [_text("object"), _text("licence", folds=True), _text("author", 3), _number("longest", 2)]
+    columns += [_number("texture", 4), _number("detail", 5), _number("clips", 1)]
+    table = FittingTable("objects", columns)
     count = Counter(clips["object_uid"])
     for i, uid in enumerate(objects["object_uid"]):
         table.add_row(
-            short_uid(uid),
+            uid,
             objects["licence"][i],
             objects["author"][i][:_AUTHOR_CHARACTERS],
             f"{100 * objects['object_scale_m'][i]:.1f} cm",
@@ -117,19 +112,25 @@ def _objects(objects: ColumnTable, clips: ColumnTable) -> Table:
     return table
 
 
-def _motions(clips: ColumnTable) -> Table:
+def _motions(clips: ColumnTable) -> FittingTable:
     """Grasp and setting of each motion; its clips share them."""
-    table = _table(
-        "motions", "motion", "object", "hand", "depth", "digits", "slip lift/turn", "tries", "light", "table"
-    )
+    columns = [
+        _number("motion"),
+        _text("object"),
+        _text("hand", 3),
+        _number("depth", 1),
+        _number("digits", 2),
+    ]
+    columns += [_number("slip", 1), _number("tries", 6), _text("light", 5), _text("table", 4)]
+    table = FittingTable("motions", columns, notes=["slip: in the lift / while turned"])
     for i in _first_clips(clips):
         table.add_row(
             str(clips["motion_index"][i]),
             short_uid(clips["object_uid"][i]),
             clips["hand_side"][i],
-            _millimetres(float(clips["max_penetration_m"][i]), 1),
+            _millimetres(float(clips["max_penetration_m"][i]), decimals=1),
             str(clips["digits_in_contact"][i]),
-            f"{_millimetres(float(clips['slip_lift_m'][i]))}/{_millimetres(float(clips['slip_manipulation_m'][i]))}",
+            _millimetres(float(clips["slip_lift_m"][i]), float(clips["slip_manipulation_m"][i])),
             str(clips["grasp_attempts"][i] or "-"),
             clips["hdri"][i],
             clips["table_material"][i] or "none",
@@ -148,13 +149,16 @@ def _hands(clips: ColumnTable) -> Counter[str]:
     return Counter(f"{model} (stands in for {other})" if other else model for model, other in pairs)
 
 
-def _millimetres(metres: float, decimals: int = 0) -> str:
-    """A length, or a dash where there is none."""
-    return "-" if np.isnan(metres) else f"{1000 * metres:.{decimals}f} mm"
+def _millimetres(*lengths_m: float, decimals: int = 0) -> str:
+    """Lengths with a slash between them, a dash for one that is not there."""
+    shown = ("-" if np.isnan(length_m) else f"{1000 * length_m:.{decimals}f}" for length_m in lengths_m)
+    return f"{'/'.join(shown)} mm"
 
 
-def _clips(clips: ColumnTable) -> Table:
-    table = _table("clips", "clip", "camera", "fps", "visible mean/min", "drift", "margin", "s/frame")
+def _clips(clips: ColumnTable) -> FittingTable:
+    columns = [_text("clip"), _text("camera"), _number("fps", 5), _number("visible mean/min", 1)]
+    columns += [_number("drift", 3), _number("margin", 2), _number("s/frame", 4)]
+    table = FittingTable("clips", columns)
     for i, clip_id in enumerate(clips["clip_id"]):
         table.add_row(
             clip_id,
@@ -172,8 +176,8 @@ def _first_clips(clips: ColumnTable) -> list[int]:
     return [int(i) for i in np.unique(clips["motion_index"], return_index=True)[1]]
 
 
-def _files(shard: Shard) -> Table:
-    table = _table("files", "file", "rows", "size", "sha256")
+def _files(shard: Shard) -> FittingTable:
+    table = FittingTable("files", [_text("file"), _number("rows"), _number("size"), _text("sha256")])
     for name, file in sorted(shard.record.files.items()):
         table.add_row(name, str(file.rows), f"{file.n_bytes / 1e6:.2f} MB", file.sha256[:12])
     total = sum(file.n_bytes for file in shard.record.files.values())
@@ -181,21 +185,21 @@ def _files(shard: Shard) -> Table:
     return table
 
 
-def _timings(shard: Shard) -> Table:
+def _timings(shard: Shard) -> FittingTable:
     seconds: dict[str, list[float]] = defaultdict(list)
     for motion in shard.record.motions:
         for phase, value in motion.timings_s.items():
             seconds[phase].append(value)
-    table = _table("time", "phase", "all motions", "median of a motion")
+    table = FittingTable("time", [_text("phase"), _number("all motions"), _number("median of a motion")])
     for phase, values in seconds.items():
         table.add_row(phase, f"{sum(values):.1f} s", f"{_median(values):.2f} s")
     return table
 
 
-def _skipped(shard: Shard) -> Table:
-    table = _table("skipped motions", "motion", "reason")
+def _skipped(shard: Shard) -> FittingTable:
+    table = FittingTable("skipped motions", [_number("motion"), _text("reason", folds=True)])
     for motion in shard.record.skipped:
-        table.add_row(str(motion.motion_index), motion.skip_reason)
+        table.add_row(str(motion.motion_index), motion.skip_reason or "")
     return table
 
 

@@ -13,11 +13,12 @@ __all__ = ["write_video"]
 
 
 def write_video(shard: Shard, clip_id: str, path: Path, *, repeats: int) -> None:
-    """Write `clip_id` (`repeats` times over, since clips are short). StorageError when it cannot be written."""
-    clip = next(clip for clip in shard.clips() if clip.clip_id == clip_id)
+    """Write `clip_id` (`repeats` times over, since clips are short). StorageError when it cannot be written;
+    DatasetNotFoundError when there is no such clip.
+    """
+    clip = shard.read_clip(clip_id)
     frames = shard.read_frames(clip_id, FRAME_COLUMNS)
-    objects = shard.read_objects(["object_uid", "object_scale_m"])
-    axis_m = 0.5 * float(objects["object_scale_m"][objects["object_uid"].index(clip.object_uid)])
+    axis_m = 0.5 * float(shard.read_object(clip.object_uid, ["object_scale_m"])["object_scale_m"][0])
     size = (2 * clip.image_width, clip.image_height)
     path.parent.mkdir(parents=True, exist_ok=True)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), clip.fps, size)

@@ -1,0 +1,1 @@
+"""What the commands do: plan a dataset, render one motion, render one shard."""

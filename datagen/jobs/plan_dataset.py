@@ -6,8 +6,8 @@ from pathlib import Path
 from datagen.config import DatasetConfig, config_as_yaml, provenance_of
 from datagen.jobs.select_motions import Selection, select_motions
 from datagen.plan.plan import PLAN_FILE, Plan, make_plan, read_plan, write_plan
-from shards.records import DatasetRecord
 from shards.schema import CONVENTIONS, SCHEMA_VERSION
+from shards.storage.records import DatasetRecord
 from shards.writer import begin_dataset
 
 __all__ = ["plan_dataset"]

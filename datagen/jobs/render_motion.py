@@ -9,7 +9,7 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import NoReturn
 
 import numpy as np
 
@@ -23,20 +23,22 @@ from datagen.jobs.planned_motion import NoGraspError, UnusableObjectError, drawn
 from datagen.objects.asset.object_asset import ObjectAsset
 from datagen.objects.targets.learning_targets import learning_targets
 from datagen.plan.plan import PLAN_FILE, MotionPlan, read_plan
-from datagen.processes.child_process import BAD_INPUT, ChildError, die_with_parent, emit, run_child
+from datagen.processes.child_process import BAD_INPUT, ChildError, Event, die_with_parent, emit, run_child
 from datagen.processes.phase_timer import PhaseTimer
 from datagen.sampling.errors import SamplingError
+from datagen.sampling.frustum import require_frustum
 from datagen.sampling.scene_sampling import SampledMotion, sample_scene
+from datagen.scene.frame_files import frame_path
 from datagen.scene.scene_file import save_scene
 from datagen.sources.hands import open_hand
 from shards.errors import ShardError
-from shards.records import Provenance
 from shards.schema import ClipRow, FrameRow
+from shards.storage.records import Provenance
 from shards.writer import motion_dir, stage_motion, stage_skipped_motion
 
-__all__ = ["RENDER_SCRIPT", "Job", "main", "run_job", "sampled_motion"]
+__all__ = ["RENDERER", "Job", "main", "run_job", "sampled_motion"]
 
-RENDER_SCRIPT = Path(__file__).resolve().parents[2] / "blender_scripts" / "render_scene.py"
+RENDERER = (sys.executable, "-m", "datagen.blender")  # a process of its own; see datagen/blender/README.md
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,7 +64,7 @@ class Job:
 def main(arguments: list[str] | None = None) -> None:
     """Render and stage one motion; progress as JSON lines on standard output."""
     parser = argparse.ArgumentParser(prog="python -m datagen.jobs.render_motion", description=main.__doc__)
-    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--config", required=True)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--motion", type=int, required=True)
     parser.add_argument("--device", required=True)
@@ -134,7 +136,7 @@ def sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledMo
         sequence = drawn_sequence(job.config, job.motion, hand.right, asset)
     emit(phase="scene", done=0, total=1)
     with timer.phase("scene"):
-        return sample_scene(
+        sampled = sample_scene(
             sequence,
             shape_hand(hand.model(sequence.side), sequence.betas),
             hand.skins,
@@ -144,6 +146,9 @@ def sampled_motion(job: Job, asset: ObjectAsset, timer: PhaseTimer) -> SampledMo
             motion_index=job.motion.motion_index,
             motion_id=job.motion.motion_id,
         )
+    with timer.phase("frustum"):
+        require_frustum(sampled, job.config.sampling.cameras)
+    return sampled
 
 
 def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderRecord:
@@ -153,29 +158,24 @@ def _rendered(job: Job, sampled: SampledMotion, timer: PhaseTimer) -> RenderReco
     save_scene(sampled.scene, scene_path)
     n_frames, n_cameras = len(sampled.scene.T_world_from_obj), len(sampled.scene.cameras)
     camera_seconds = np.zeros(n_cameras)
-    summary: dict[str, Any] = {}
     done = 0
 
-    def on_event(event: dict[str, Any]) -> None:
+    def on_event(event: Event) -> None:
         nonlocal done
         if event["event"] == "frame":
             done += 1
             camera_seconds[event["camera"]] += sum(event["seconds"].values())
             emit(phase="render", done=done, total=n_cameras * n_frames)
-        elif event["event"] == "done":
-            summary.update(event)
 
-    command = [
-        sys.executable,
-        str(RENDER_SCRIPT),
-        "--scene",
-        str(scene_path),
-        "--frames-dir",
-        str(job.work_dir),
-    ]
+    command = [*RENDERER, "--scene", str(scene_path), "--frames-dir", str(job.work_dir)]
     command += ["--device", job.device, "--threads", str(job.threads)]
     with timer.phase("blender"):
-        run_child(command, log=job.work_dir / "blender.log", on_event=on_event)
+        summary = run_child(
+            command,
+            log=job.work_dir / "blender.log",
+            on_event=on_event,
+            is_last=lambda event: event["event"] == "done",
+        )
     for phase, seconds in summary["seconds"].items():
         timer.add(f"blender.{phase}", seconds)
     return RenderRecord(
@@ -199,8 +199,8 @@ def _rows(
             annotated = annotate_frame(geometry, frame)
         with timer.phase("pack"):
             for camera, buffers in enumerate(annotated):
-                png = job.work_dir / f"cam-{camera:02d}" / f"frame-{frame:04d}.png"
-                rgb = encoded_rgb(png.read_bytes(), job.config.shard)
+                png = frame_path(job.work_dir, camera, frame).read_bytes()
+                rgb = encoded_rgb(png, job.config.shard)
                 rows[camera].append(
                     frame_row(
                         job.motion, sampled, camera, frame, buffers, distances_m[frame], rgb, job.config.shard

@@ -15,13 +15,12 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from datagen.config import DatasetConfig, provenance_of
 from datagen.plan.plan import MotionPlan, Plan
 from datagen.plan.selection_rules import read_takedown, taken_down
-from datagen.processes.child_process import BAD_INPUT, ChildError, run_child
-from shards.records import Provenance, ShardRecord
+from datagen.processes.child_process import BAD_INPUT, ChildError, Event, run_child
+from shards.storage.records import Provenance, ShardRecord
 from shards.writer import (
     commit_shard,
     is_motion_staged,
@@ -29,6 +28,7 @@ from shards.writer import (
     motion_dir,
     shard_dir,
     stage_skipped_motion,
+    staging_dir,
 )
 
 __all__ = ["PipelineError", "RenderOptions", "ShardProgress", "render_shard"]
@@ -59,7 +59,7 @@ class ShardProgress:
 
 
 def render_shard(
-    config_path: Path,
+    config_name: str | Path,
     config: DatasetConfig,
     plan: Plan,
     out: Path,
@@ -75,14 +75,14 @@ def render_shard(
     motions = plan.shard(shard)
     indices = [motion.motion_index for motion in motions]
     provenance = provenance_of(config)
-    with _lock(out / "staging" / f"shard-{shard:05d}.lock"):
+    with _lock(staging_dir(out, shard).with_suffix(".lock")):
         _take_down(motions, out, shard, read_takedown(config.selection.takedown), provenance)
         if not is_shard_committed(out, shard):
             staged = [index for index in indices if is_motion_staged(out, shard, index, provenance)]
             for index in staged:
                 report(ShardProgress(motion_index=index, phase="staged", done=1, total=1))
             waiting = [index for index in indices if index not in staged]
-            _run_workers(config_path, out, waiting, shard, options, report)
+            _run_workers(config_name, out, waiting, shard, options, report)
         return commit_shard(out, shard, motion_indices=indices, provenance=provenance)
 
 
@@ -110,7 +110,7 @@ def _take_down(
 
 
 def _run_workers(
-    config_path: Path,
+    config_name: str | Path,
     out: Path,
     motion_indices: list[int],
     shard: int,
@@ -121,7 +121,7 @@ def _run_workers(
     report_lock = threading.Lock()
 
     def render(motion_index: int) -> ChildError | None:
-        def on_event(event: dict[str, Any]) -> None:
+        def on_event(event: Event) -> None:
             with report_lock:
                 report(ShardProgress(motion_index=motion_index, **event))
 
@@ -130,18 +130,21 @@ def _run_workers(
             "-m",
             "datagen.jobs.render_motion",
             "--config",
-            str(config_path),
+            str(config_name),
             "--out",
             str(out),
         ]
         command += ["--motion", str(motion_index), "--device", options.device, "--threads", str(threads)]
         if options.licence_allow is not None:
             command += ["--license-allow", ",".join(options.licence_allow)]
-        log = out / "staging" / f"shard-{shard:05d}" / f"motion-{motion_index:06d}.log"
         try:
-            # BLAS threads would only fight with Cycles, and one thread sums in one order everywhere.
             run_child(
-                command, log=log, on_event=on_event, env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+                command,
+                log=motion_dir(out, shard, motion_index).with_suffix(".log"),
+                on_event=on_event,
+                is_last=lambda event: event["phase"] in ("done", "skipped"),
+                # BLAS threads would only fight with Cycles, and one thread sums in one order everywhere.
+                env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             )
         except ChildError as error:
             return error

@@ -5,8 +5,6 @@ import fcntl
 import functools
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
@@ -31,6 +29,7 @@ from datagen.plan.selection_rules import (
 )
 from datagen.sources.motions import recorded_sequences
 from datagen.sources.objects import library_state, open_library
+from shards.storage.whole_file import write_whole
 
 __all__ = ["SELECTION_FILE", "Selection", "select_motions"]
 
@@ -231,11 +230,8 @@ def _write(selection: Selection, path: Path, key: str) -> None:
         for field in fields(Decision)
     }
     table = pa.table(columns).replace_schema_metadata({_KEY: key.encode()})
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        pq.write_table(table, file, compression="zstd", write_page_checksum=True)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(file.name, path)
+    with write_whole(path, durable=True) as partial:
+        pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
 
 
 def _read(path: Path, key: str, unmatched: tuple[str, ...]) -> Selection | None:

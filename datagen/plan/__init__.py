@@ -1,0 +1,1 @@
+"""Which motion goes into which shard, and which motions are worth drawing."""

@@ -5,8 +5,6 @@ camera. The plan is a pure function of the configuration, so that any shard, on 
 machine, in any order, is the same.
 """
 
-import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,6 +16,7 @@ import pyarrow.parquet as pq
 from datagen.objects.asset.mirror import mirrored_uid
 from datagen.sampling.streams import Stream, stream_rng
 from shards.splits import SplitRule, split_of_object
+from shards.storage.whole_file import write_whole
 
 __all__ = [
     "PLAN_FILE",
@@ -172,11 +171,8 @@ def write_plan(plan: Plan, path: Path) -> None:
     """Write plan.parquet in one step: a reader sees the old file, the new one, or none."""
     columns = {field.name: [getattr(m, field.name) for m in plan.motions] for field in fields(MotionPlan)}
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-        pq.write_table(pa.table(columns), file, compression="zstd", write_page_checksum=True)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(file.name, path)
+    with write_whole(path, durable=True) as partial:
+        pq.write_table(pa.table(columns), partial, compression="zstd", write_page_checksum=True)
 
 
 def read_plan(path: Path) -> Plan:

@@ -1,0 +1,1 @@
+"""Child processes that report by events, and seconds per phase."""

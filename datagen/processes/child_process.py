@@ -14,7 +14,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-__all__ = ["BAD_INPUT", "ChildError", "die_with_parent", "emit", "run_child"]
+__all__ = ["BAD_INPUT", "ChildError", "Event", "die_with_parent", "emit", "run_child"]
+
+Event = dict[str, Any]
 
 BAD_INPUT = 2  # exit status of a child that says in one line what the user got wrong
 LOG_LINES_SHOWN = 12
@@ -53,14 +55,17 @@ def run_child(
     command: Sequence[str],
     *,
     log: Path,
-    on_event: Callable[[dict[str, Any]], None],
+    on_event: Callable[[Event], None],
+    is_last: Callable[[Event], bool],
     env: dict[str, str] | None = None,
-) -> None:
+) -> Event:
     """Run `command`, hand every JSON line of its output to `on_event`, keep the rest in `log`.
 
-    Raises ChildError when the child exits with a status other than 0; its message is the end of the log,
-    one line of it when the status is BAD_INPUT.
+    The result is the event that `is_last` recognises, with which the child says that its work is done.
+    Raises ChildError when the child exits with a status other than 0, or without that event; its message is
+    the end of the log, one line of it when the status is BAD_INPUT.
     """
+    last: Event | None = None
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as log_file:
         start = log_file.tell()
@@ -70,11 +75,13 @@ def run_child(
         assert process.stdout is not None
         try:
             for line in process.stdout:
-                if line.startswith("{"):
-                    on_event(json.loads(line))
-                else:
+                event = _event(line)
+                if event is None:
                     log_file.write(line.encode())
                     log_file.flush()
+                    continue
+                on_event(event)
+                last = event if is_last(event) else last
             status = process.wait()
         except BaseException:
             process.kill()
@@ -82,10 +89,21 @@ def run_child(
             raise
     if status == BAD_INPUT:
         raise ChildError(_log_end(log, start, lines=1), status=status, log=log)
-    if status != 0:
+    if status != 0 or last is None:
         ended = f"by signal {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
+        ended += "" if status else " and did not say that it was done"
         end = _log_end(log, start, lines=LOG_LINES_SHOWN)
         raise ChildError(f"{end}\n(child ended {ended}; full log: {log})", status=status, log=log)
+    return last
+
+
+def _event(line: str) -> Event | None:
+    """The event in a line of output; None for anything else that a library prints."""
+    try:
+        event = json.loads(line) if line.startswith("{") else None
+    except ValueError:
+        return None
+    return event if isinstance(event, dict) else None
 
 
 def _log_end(log: Path, start: int, *, lines: int) -> str:

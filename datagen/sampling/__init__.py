@@ -1,0 +1,1 @@
+"""All randomness between a grasp sequence and its images."""

@@ -11,7 +11,6 @@ from datagen.hands.skin import (
     SkinBasis,
     decode_skin,
     open_nail_mask_png,
-    open_skin_height_png,
     sample_skin_coefficients,
 )
 from datagen.scene.scene import HandLook
@@ -79,7 +78,6 @@ def sample_look(
         sleeve_color_rgb=_sleeve_color(sleeve_rng),
         sleeve_weave=float(sleeve_rng.uniform(*config.sleeve_weave)),
         nail_mask_png=open_nail_mask_png() if skins.name == OPEN_SKIN else None,
-        skin_height_png=open_skin_height_png() if skins.name == OPEN_SKIN else None,
     )
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from datagen.geometry.raycast import TriangleCaster
 from datagen.grasps.sequence import GraspSequence
@@ -32,7 +32,6 @@ class SampledMotion:
 
     scene: Scene
     sequence: GraspSequence  # where it comes from, whole
-    sequence_frames: Int[np.ndarray, " frame"]  # which of its frames are drawn
     grasp_frame: int  # first drawn frame in which the hand carries the object; n_frames: never
     hand_orientation_world: Float[np.ndarray, "frame 3"]
     hand_pose: Float[np.ndarray, "frame 45"]
@@ -102,7 +101,6 @@ def sample_scene(
     return SampledMotion(
         scene=scene,
         sequence=sequence,
-        sequence_frames=frames,
         grasp_frame=placed.window.first_grasped(sequence),
         hand_orientation_world=sequence.hand_orientation_world[frames],
         hand_pose=sequence.hand_pose[frames],

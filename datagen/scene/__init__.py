@@ -1,0 +1,1 @@
+"""Scene: everything that decides the images of one motion, and its file."""

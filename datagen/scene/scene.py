@@ -97,7 +97,6 @@ class HandLook:
     sleeve_color_rgb: tuple[float, float, float]  # linear
     sleeve_weave: float  # size of the weave; 1: threads 1.2 mm apart
     nail_mask_png: bytes | None = None  # white on the nails, in the UV layout of `skin_png`
-    skin_height_png: bytes | None = None  # relief in the same layout: 128 level, full range about 1 mm
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,9 +2,7 @@
 
 import dataclasses
 import hashlib
-import io
 import json
-import os
 import types
 import typing
 import zipfile
@@ -14,10 +12,11 @@ from typing import Any
 import numpy as np
 
 from datagen.scene.scene import Scene
+from shards.storage.whole_file import write_whole
 
 __all__ = ["SCENE_FILE_VERSION", "SceneFileError", "load_scene", "save_scene", "scene_sha256"]
 
-SCENE_FILE_VERSION = 1
+SCENE_FILE_VERSION = 2
 
 
 class SceneFileError(ValueError):
@@ -30,11 +29,8 @@ def save_scene(scene: Scene, path: Path) -> None:
     tree = _encode(scene, blobs)
     header = {"version": SCENE_FILE_VERSION, "sha256": _digest(tree, blobs), "scene": tree}
     arrays = {f"blob_{index}": blob for index, blob in enumerate(blobs)}
-    buffer = io.BytesIO()
-    np.savez(buffer, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
-    partial = path.with_name(f"{path.name}.partial-{os.getpid()}")
-    partial.write_bytes(buffer.getbuffer())
-    os.replace(partial, path)
+    with write_whole(path) as partial, partial.open("wb") as file:
+        np.savez(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
 
 
 def load_scene(path: Path) -> Scene:

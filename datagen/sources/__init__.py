@@ -1,0 +1,1 @@
+"""From sections of a configuration to objects, hands and motions."""

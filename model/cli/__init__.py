@@ -1,0 +1,1 @@
+"""The `forehoi` command: parse, call, print."""

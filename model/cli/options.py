@@ -2,8 +2,8 @@
 
 from model.errors import ModelError
 from model.training.trainer import NonFiniteLossError, TrainingStopped
+from shards.commands.plain_errors import plain_errors as plain_errors_of
 from shards.errors import ShardError
-from shards.plain_errors import plain_errors as plain_errors_of
 from shards.settings import SettingsError
 
 __all__ = ["plain_errors"]

@@ -4,17 +4,17 @@ Built once in the main process from clips.parquet alone; small enough to send to
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 from model.data.config import Cameras, StreamConfig
 from model.errors import ModelError
 from shards.errors import CorruptShardError, MissingColumnError
-from shards.reader import Shard, open_dataset, open_shard
-from shards.splits import Split
+from shards.reader import Shard, open_shards
+from shards.splits import ObjectSplits, Split
 
-__all__ = ["FRAME_COLUMNS", "MotionIndex", "MotionRef", "check_object_splits", "open_motions"]
+__all__ = ["FRAME_COLUMNS", "MotionIndex", "MotionRef", "open_motions"]
 
 FRAME_COLUMNS = (
     "T_cam_from_world",
@@ -52,21 +52,20 @@ class MotionIndex:
 
     shards: tuple[Shard, ...]
     motions: tuple[MotionRef, ...]
-    split_of_object: dict[str, tuple[Split, str]]  # identity -> split, and the shard that says so
 
 
 def open_motions(config: StreamConfig) -> MotionIndex:
     """The motions of `config.split`, with the cameras it asks for.
 
-    Raises ModelError when there is no shard or no motion, when an object is in two splits or when a
-    motion has fewer frames than views are wanted; ShardError for damaged or incomplete data.
+    Raises ModelError when there is no motion or one has fewer frames than views are wanted; SplitError when an
+    object is in two splits, over all datasets; ShardError for missing, damaged or incomplete data.
     """
-    shards = tuple(shard for url in config.datasets for shard in _open_shards(url))
+    shards = tuple(shard for url in config.datasets for shard in open_shards(url))
     with ThreadPoolExecutor(_READERS) as pool:
         found = list(pool.map(_motions_of_shard, range(len(shards)), shards))
-    split_of_object = _merged_splits(
-        (motion, shards[motion.shard].path) for motions in found for motion in motions
-    )
+    splits = ObjectSplits()
+    for motion in (motion for motions in found for motion in motions):
+        splits.add(motion.object_uid, motion.split, where=shards[motion.shard].path)
     of_split = [motion for motions in found for motion in motions if motion.split == config.split]
     chosen = [
         motion
@@ -75,32 +74,7 @@ def open_motions(config: StreamConfig) -> MotionIndex:
     ]
     _check_enough(chosen, found, config)
     # `replace` drops the file footers that were cached on the way, so little is sent to the workers
-    return MotionIndex(
-        shards=tuple(replace(shard) for shard in shards),
-        motions=tuple(chosen),
-        split_of_object=split_of_object,
-    )
-
-
-def check_object_splits(indices: Iterable[MotionIndex]) -> None:
-    """ModelError if an object is in two splits of streams over different datasets."""
-    merged: dict[str, tuple[Split, str]] = {}
-    for index in indices:
-        for identity, (split, where) in index.split_of_object.items():
-            _add_split(merged, identity, split, where)
-
-
-def _open_shards(url: str) -> tuple[Shard, ...]:
-    name = url.rstrip("/").rsplit("/", 1)[-1]
-    shards = (open_shard(url),) if name.startswith("shard-") else open_dataset(url).shards
-    if not shards:
-        raise ModelError(
-            url,
-            "no finished shard",
-            expected="at least one shards/shard-*/shard.json",
-            action="Render one (make render SHARD=0), or name shard folders where a server lists nothing.",
-        )
-    return shards
+    return MotionIndex(shards=tuple(replace(shard) for shard in shards), motions=tuple(chosen))
 
 
 def _motions_of_shard(number: int, shard: Shard) -> list[MotionRef]:
@@ -152,24 +126,6 @@ def _with_cameras(motion: MotionRef, cameras: Cameras, held_out_share: float) ->
     return replace(motion, clip_rows=motion.clip_rows[kept], frame_counts=motion.frame_counts[kept])
 
 
-def _merged_splits(motions: Iterable[tuple[MotionRef, str]]) -> dict[str, tuple[Split, str]]:
-    merged: dict[str, tuple[Split, str]] = {}
-    for motion, where in motions:
-        _add_split(merged, motion.object_uid.partition("@")[0], motion.split, where)
-    return merged
-
-
-def _add_split(merged: dict[str, tuple[Split, str]], identity: str, split: Split, where: str) -> None:
-    known, known_where = merged.setdefault(identity, (split, where))
-    if known != split:
-        raise ModelError(
-            where,
-            f"object '{identity}' is in split {split} here and in {known} in {known_where}",
-            expected="each object in one split",
-            action="Leave one of the datasets out, or render them with the same split fractions.",
-        )
-
-
 def _check_enough(
     chosen: Sequence[MotionRef], found: Sequence[Sequence[MotionRef]], config: StreamConfig
 ) -> None:
@@ -192,5 +148,5 @@ def _check_enough(
                 places,
                 f"{motion.motion_id} has {motion.n_frames} frames with cameras '{config.cameras}'",
                 expected=f"at least the {config.views[1]} views asked for",
-                action="Lower data.views.",
+                action="Lower `views` in the recipe, or in `validation`.",
             )

@@ -19,7 +19,6 @@ from model.data.index import FRAME_COLUMNS, MotionIndex, MotionRef
 from model.data.order import RandomStream, SampleKey, random_stream
 from shards.errors import CorruptShardError, ImageError, RowError
 from shards.reader import ColumnTable
-from shards.schema import ObjectRow
 from shards.storage.bounded_cache import BoundedCache
 from shards.storage.frame_pages import FramePages, local_pages
 
@@ -89,7 +88,7 @@ class SampleReader:
     def read(self, key: SampleKey) -> tuple[TrainingSample, tuple[str, ...]]:
         """The sample, and one line for each corrupt row met on the way.
 
-        A corrupt row raises its ShardError when `on_corrupt` is "raise". Otherwise other views of the
+        A corrupt row raises its ShardError where `max_corrupt` is 0. Otherwise other views of the
         motion, then other motions take its place: a function of (seed, epoch, position) and the data.
         """
         motion = self._index.motions[key.item]
@@ -105,7 +104,7 @@ class SampleReader:
                 views = choose_views(motion, key.n_views, views_rng)
                 return self._sample(motion, views, crop_rng), tuple(faults)
             except _CORRUPT as error:
-                if self._config.on_corrupt == "raise":
+                if self._config.max_corrupt == 0:
                     raise
                 faults.append(str(error))
         raise CorruptShardError(
@@ -124,7 +123,6 @@ class SampleReader:
         sample = TrainingSample(
             motion_id=motion.motion_id,
             object_uid=motion.object_uid,
-            split=motion.split,
             clip_ids=tuple(clips["clip_id"][row] for row, _ in chosen),
             frame_indices=np.array([frame for _, frame in chosen]),
             images=_planes([view.image for view in views]),
@@ -182,32 +180,31 @@ class SampleReader:
         )
 
     def _read_object(self, motion: MotionRef) -> _Object:
-        source = self._index.shards[motion.shard].source("objects")
-        for group in range(source.num_row_groups):
-            uids = source.read_row_group(group, ["object_uid"])["object_uid"].to_pylist()
-            if motion.object_uid in uids:
-                columns = _TARGET_COLUMNS + (_SURFACE_COLUMNS if self._config.surface else ())
-                table = ColumnTable(source.read_row_group(group, list(columns)), ObjectRow, where=source.path)
-                row = uids.index(motion.object_uid)
-                voxels = table["occupancy_64"][row]
-                if len(voxels) and voxels.max() >= OCCUPANCY_VOXELS:
-                    raise RowError("voxel outside 0..63", where=source.path, row=motion.object_uid)
-                return _Object(
-                    T_objmesh_from_canonical=table["T_objmesh_from_canonical"][row],
-                    voxels=voxels,
-                    surface=_surface(table, row) if self._config.surface else None,
-                )
-        raise CorruptShardError("no such object", where=source.path, row=motion.object_uid)
+        shard, uid = self._index.shards[motion.shard], motion.object_uid
+        if not shard.has_object(uid):
+            raise CorruptShardError(
+                "the object of a clip is missing", where=f"{shard.path}/objects.parquet", row=uid
+            )
+        columns = _TARGET_COLUMNS + (_SURFACE_COLUMNS if self._config.surface else ())
+        table = shard.read_object(uid, columns)
+        voxels = table["occupancy_64"][0]
+        if len(voxels) and voxels.max() >= OCCUPANCY_VOXELS:
+            raise RowError("voxel outside 0..63", where=table.where)
+        return _Object(
+            T_objmesh_from_canonical=table["T_objmesh_from_canonical"][0],
+            voxels=voxels,
+            surface=_surface(table) if self._config.surface else None,
+        )
 
 
-def _surface(table: ColumnTable, row: int) -> SurfaceTarget:
+def _surface(table: ColumnTable) -> SurfaceTarget:
     return SurfaceTarget(
-        points=table["surface_points"][row],
-        normals=table["surface_normals"][row],
-        colors=table["surface_colors"][row],
-        sdf_points=table["sdf_points"][row],
-        sdf_values=table["sdf_values"][row],
-        object_scale_m=float(table["object_scale_m"][row]),
+        points=table["surface_points"][0],
+        normals=table["surface_normals"][0],
+        colors=table["surface_colors"][0],
+        sdf_points=table["sdf_points"][0],
+        sdf_values=table["sdf_values"][0],
+        object_scale_m=float(table["object_scale_m"][0]),
     )
 
 

@@ -26,7 +26,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from model.data.batch import OCCUPANCY_VOXELS, Batch, stack_samples
 from model.data.config import StreamConfig, validation_config
-from model.data.index import MotionIndex, check_object_splits, open_motions
+from model.data.index import MotionIndex, open_motions
 from model.data.order import SampleKey, StreamState, rank_batches
 from model.data.reader import SampleReader
 from model.errors import ModelError
@@ -36,7 +36,6 @@ __all__ = [
     "ShardStream",
     "StreamConfig",
     "StreamState",
-    "check_object_splits",
     "open_motions",
     "validation_config",
 ]
@@ -65,7 +64,7 @@ class ShardStream:
             )
         if config.endless and config.batch_size % world_size:
             raise ModelError(
-                "data.batch_size",
+                "recipe.batch_size",
                 f"{config.batch_size} samples cannot be shared by {world_size} ranks",
                 expected="a multiple of the number of ranks",
                 action="batch_size counts the samples of all ranks together.",

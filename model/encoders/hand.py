@@ -1,5 +1,5 @@
 """The open hand encoder: a small decoder on the frozen ImageNet pyramid, trained on our own shards to find the hand,
-its 21 joints and what it holds. On few images this beats a network trained from nothing by far (DECISIONS.md).
+its 21 joints and what it holds. On few images this beats a network trained from scratch by far (DECISIONS D39).
 
 `forehoi train hand_encoder` makes its weights (`hand_training.py`); `packaged_hand_net` gives those that ship with
 the package (model/encoders/data). It sees the same crop as the image encoder.
@@ -7,7 +7,6 @@ the package (model/encoders/data). It sees the same crop as the image encoder.
 
 import hashlib
 import json
-import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -22,6 +21,7 @@ from model.encoders.efficientnet import PYRAMID_CHANNELS, ImageNetPyramid
 from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
 from model.tensor_files.safetensors_file import write_tensors
+from shards.storage.whole_file import write_whole
 
 __all__ = [
     "N_JOINTS",
@@ -40,9 +40,7 @@ _COARSEST = max(PYRAMID_CHANNELS)
 _BACKBONE = "backbone."  # frozen, from its own package: not in our file
 _WEIGHTS, _CONFIG = "hand_encoder.safetensors", "hand_encoder.json"
 _PACKAGED = Path(__file__).parent / "data"
-_ACTION = (
-    "Make it with `forehoi train hand_encoder` (configs/model/hands.yaml), or give the folder of a made one."
-)
+_ACTION = "Make it with `forehoi train hand_encoder --config hands`, or give the folder of a made one."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -193,9 +191,8 @@ def save_hand_net(network: HandNet, folder: Path, *, dtype: torch.dtype) -> None
     folder.mkdir(parents=True, exist_ok=True)
     own = {name: value for name, value in network.state_dict().items() if not name.startswith(_BACKBONE)}
     write_tensors(folder / _WEIGHTS, {name: value.to(dtype) for name, value in own.items()})
-    config = folder / f"{_CONFIG}.part"
-    config.write_text(json.dumps(asdict(network.config), indent=1) + "\n", encoding="utf-8")
-    os.replace(config, folder / _CONFIG)
+    with write_whole(folder / _CONFIG) as partial:
+        partial.write_text(json.dumps(asdict(network.config), indent=1) + "\n", encoding="utf-8")
 
 
 def load_hand_net(folder: Path) -> HandNet:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from model.video.frames import VideoFrames
-from model.video.shard_clip import shards_at
+from shards.reader import find_clip, open_shards
 
 __all__ = ["KnownScale", "known_scale"]
 
@@ -21,9 +21,7 @@ def known_scale(frames: VideoFrames) -> KnownScale | None:
     if frames.kind != "clip":
         return None
     address, _, clip_id = frames.source.rpartition("#")
-    shard = next(shard for shard in shards_at(address) if clip_id in shard.record.clip_ids)
-    clips = shard.read_clips(("clip_id", "object_uid"))
-    uid = clips["object_uid"][clips["clip_id"].index(clip_id)]
-    objects = shard.read_objects(("object_uid", "object_scale_m"))
-    metres = float(objects["object_scale_m"][objects["object_uid"].index(uid)])
+    shard = find_clip(open_shards(address), clip_id, where=address)
+    of_object = shard.read_object(shard.read_clip(clip_id).object_uid, ("object_scale_m",))
+    metres = float(of_object["object_scale_m"][0])
     return KnownScale(metres_per_unit=metres, origin="annotation of the dataset, not the images")

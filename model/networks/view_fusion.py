@@ -1,4 +1,4 @@
-"""What passes between the branches: the fusion weights w_n of Eq. 1 and the projected mask tokens."""
+"""What passes from the views to the geometry: the fusion weights w_n of Eq. 1, and the context of each view."""
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -29,20 +29,26 @@ class ViewFusion(nn.Module):
 
 
 class MaskContext(nn.Module):
-    """Mask-branch tokens as the condition of geometry blocks: layer norm, then a projection shared by all blocks.
+    """What geometry blocks attend to: projected layer-normed mask tokens, added to image features where there are any.
 
-    Published weights expect layer-normed image features of width `condition_channels`. Under LoRA their to_kv
-    is frozen; this projection is trained whole and carries the mask tokens into the space to_kv expects.
+    Published weights expect layer-normed image features of width `condition_channels`. With `starts_at_zero` they get
+    exactly these at the start, since the projection starts at zero. Without image features to add to, the projection
+    starts as any layer does. All blocks share it; under LoRA their to_kv is frozen, and it is trained whole.
     """
 
-    def __init__(self, channels: int, condition_channels: int) -> None:
+    def __init__(self, channels: int, condition_channels: int, *, starts_at_zero: bool) -> None:
         super().__init__()
         self.projection = nn.Linear(channels, condition_channels)
         nn.init.xavier_uniform_(self.projection.weight)
         nn.init.zeros_(self.projection.bias)
+        if starts_at_zero:
+            nn.init.zeros_(self.projection.weight)
 
     def forward(
-        self, tokens: Float[Tensor, "batch view token channel"]
+        self,
+        tokens: Float[Tensor, "batch view token channel"],
+        images: Float[Tensor, "batch view token condition"] | None,
     ) -> Float[Tensor, "batch view token condition"]:
-        """One context per view; views stay apart."""
-        return self.projection(layer_norm(tokens))
+        """One context per view; views stay apart. `images`: layer-normed image features of the same token grid."""
+        projected = self.projection(layer_norm(tokens))
+        return projected if images is None else images + projected

@@ -1,6 +1,5 @@
 """Stage 1 as one module and its training: amodal masks and shape denoised together (paper, 3.1-3.3)."""
 
-import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -28,12 +27,12 @@ from model.flow import (
     times_from_uniform,
     velocity_target,
 )
-from model.sparse_structure.dual_branch import DualBranchFlow
-from model.sparse_structure.prediction import Prediction
+from model.networks.transformer import layer_norm
+from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow, DualCondition
 from model.sparse_structure.stage_one_images import prediction_rows
 from model.sparse_structure.vae import StructureVae, occupancy_from_logits
-from model.training.step_generators import normal_like, uniform
-from model.training.task import Evaluation, Losses, Measurements
+from model.training.step_generators import batch_generator, normal_like, uniform
+from model.training.task import Losses, Measurements
 
 METRICS = (
     "voxel_iou",
@@ -49,7 +48,7 @@ METRICS = (
 )
 OCCLUDED = 0.2
 
-__all__ = ["METRICS", "StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
+__all__ = ["METRICS", "Prediction", "StageOne", "StageOneConfig", "StageOneTask", "mask_targets"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,12 +64,37 @@ class StageOneConfig:
 
 
 class StageOne(nn.Module):
-    """The trained parts: feature aggregator and dual-branch flow."""
+    """The trained parts: feature aggregator and dual-branch flow.
 
-    def __init__(self, aggregator: FeatureAggregator, flow: DualBranchFlow) -> None:
+    Published weights of the geometry branch expect layer-normed image features. Where the image encoder is as wide as
+    its condition, the branch gets exactly these at the start, and mask tokens in addition as training brings them in;
+    where it is not, the geometry sees the images through the mask tokens alone.
+    """
+
+    def __init__(self, aggregator: FeatureAggregator, config: DualBranchConfig) -> None:
         super().__init__()
         self.aggregator = aggregator
-        self.flow = flow
+        self._image_context = aggregator.config.image_channels == config.geometry.condition_channels
+        self.flow = DualBranchFlow(config, image_context=self._image_context)
+
+    def condition(
+        self,
+        image_tokens: Float[Tensor, "batch view token image_channel"],
+        hand_tokens: Float[Tensor, "batch view hand_token hand_channel"],
+    ) -> DualCondition:
+        """From the features of the views (section 3.1); a sampler computes it once for all its steps."""
+        return DualCondition(
+            features=self.aggregator(image_tokens, hand_tokens),
+            images=layer_norm(image_tokens) if self._image_context else None,
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """What stage 1 says about a batch of views."""
+
+    occupancy: Bool[Tensor, "batch 64 64 64"]
+    masks: Float[Tensor, "batch view m m"]  # amodal object mask: above 0 inside
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -94,11 +118,9 @@ class StageOneTask:
         inner = uncached(self.hand_encoder)
         return inner.network if isinstance(inner, HandEncoder) else None
 
-    def features(
-        self, images: Float[Tensor, "batch view 3 size size"]
-    ) -> Float[Tensor, "batch view token channel"]:
-        """Image and hand features, aggregated (section 3.1)."""
-        return self.network.aggregator(self.image_encoder(images), self.hand_encoder(images))
+    def condition(self, images: Float[Tensor, "batch view 3 size size"]) -> DualCondition:
+        """What the flow knows of the views: frozen features, aggregated."""
+        return self.network.condition(self.image_encoder(images), self.hand_encoder(images))
 
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
         """Eq. 2: one t for both branches of a sample, condition dropped at random."""
@@ -108,10 +130,9 @@ class StageOneTask:
         t = times_from_uniform(self.config.time, uniform(generators, device))
         dropped = uniform(generators, device) < self.config.drop_condition
         noise_latent, noise_masks = normal_like(latent, generators), normal_like(masks, generators)
-        features = self.features(batch.images)
-        flow = self.network.flow
-        features = torch.where(dropped[:, None, None, None], flow.unconditional_features(features), features)
-        velocity = flow(interpolate(latent, noise_latent, t), interpolate(masks, noise_masks, t), t, features)
+        condition = self.condition(batch.images).dropped(dropped)
+        latent_t, masks_t = interpolate(latent, noise_latent, t), interpolate(masks, noise_masks, t)
+        velocity = self.network.flow(latent_t, masks_t, t, condition)
         losses = joint_cfm_loss(
             predicted_masks=velocity.masks,
             target_masks=velocity_target(masks, noise_masks),
@@ -132,21 +153,14 @@ class StageOneTask:
         self, images: Float[Tensor, "batch view 3 size size"], generator: torch.Generator
     ) -> Prediction:
         """Denoise masks and shape together; guidance as `config.guidance` says, per tensor name."""
-        features = self.features(images)
-        flow = self.network.flow
-        resolution = flow.config.masks.mask_resolution
+        condition, flow = self.condition(images), self.network.flow
+        features, resolution = condition.features, flow.config.masks.mask_resolution
         empty = {
             "geometry": features.new_zeros(len(images), *flow.config.geometry.latent_shape),
             "masks": features.new_zeros(*images.shape[:2], 1, resolution, resolution),
         }
-
-        def velocity_with(condition: Tensor) -> "_Velocity":
-            return _Velocity(flow, condition)
-
         velocity = guided(
-            velocity_with(features),
-            velocity_with(flow.unconditional_features(features)),
-            self.config.guidance,
+            _Velocity(flow, condition), _Velocity(flow, condition.unconditional()), self.config.guidance
         )
         noise = noise_like({k: v.cpu() for k, v in empty.items()}, generator)
         clean = euler_sample(
@@ -155,29 +169,19 @@ class StageOneTask:
         logits = self.vae.decoder(clean["geometry"] * self.config.latent_scale)
         return Prediction(occupancy=occupancy_from_logits(logits), masks=clean["masks"][:, :, 0])
 
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Means of FIGURES over samples or views; a metric without views is NaN."""
-        return self.measure(batches).evaluation()
-
     @torch.no_grad()
     def measure(self, batches: Iterable[Batch]) -> Measurements:
-        """FIGURES of every sample or view, with noise that belongs to the batch."""
+        """METRICS of every sample or view, with noise that belongs to the batch."""
         numbers: dict[str, list[float]] = {name: [] for name in METRICS}
         images: dict[str, np.ndarray] = {}
         for batch in batches:
-            found = self.predict(batch.images, _noise_of(batch))
+            found = self.predict(batch.images, batch_generator(batch.ids))
             scores = _shape_scores(batch, found, self.mean_shape) | _mask_scores(batch, found, self.hand_net)
             for name, values in scores.items():
                 numbers[name] += values.tolist()
             if not images:
-                images = {"prediction": prediction_rows(batch, found)}
+                images = {"prediction": prediction_rows(batch, found.masks, found.occupancy)}
         return Measurements(numbers=numbers, images=images)
-
-
-def _noise_of(batch: Batch) -> torch.Generator:
-    """Always the same for the same samples, whatever was measured before."""
-    digest = hashlib.blake2b("\n".join(batch.ids).encode(), digest_size=4).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest))
 
 
 def _shape_scores(
@@ -212,10 +216,10 @@ class _Velocity:
     """The flow as the sampler calls it."""
 
     flow: DualBranchFlow
-    features: Tensor
+    condition: DualCondition
 
     def __call__(self, state: dict[str, Tensor], t: Tensor) -> dict[str, Tensor]:
-        velocity = self.flow(state["geometry"], state["masks"], t, self.features)
+        velocity = self.flow(state["geometry"], state["masks"], t, self.condition)
         return {"geometry": velocity.geometry.float(), "masks": velocity.masks.float()}
 
 

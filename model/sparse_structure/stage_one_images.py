@@ -1,13 +1,12 @@
-"""What stage 1 sees and finds, side by side."""
+"""What stage 1 sees and predicts, side by side."""
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
 from model.data.batch import Batch
 from model.evaluation.voxel_image import voxel_image
-from model.sparse_structure.prediction import Prediction
 
 __all__ = ["prediction_rows"]
 
@@ -15,8 +14,13 @@ TILE = 128
 SAMPLES, VIEWS = 3, 3
 
 
-def prediction_rows(batch: Batch, found: Prediction) -> UInt8[np.ndarray, "height width 3"]:
-    """A row per sample: for each view input, visible, true and found amodal mask; then true and found voxels."""
+def prediction_rows(
+    batch: Batch, masks: Float[Tensor, "batch view m m"], occupancy: Bool[Tensor, "batch 64 64 64"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """A row per sample: for each view input, visible, true and predicted amodal mask; then true and predicted voxels.
+
+    `masks` and `occupancy` are the predicted ones, as in `Prediction`.
+    """
     rows = []
     for s in range(min(SAMPLES, len(batch.ids))):
         tiles = []
@@ -27,8 +31,8 @@ def prediction_rows(batch: Batch, found: Prediction) -> UInt8[np.ndarray, "heigh
                 _grey(batch.object_visible[s, v].float()),
                 _grey(batch.object_amodal[s, v].float()),
             ]
-            tiles.append(_grey((found.masks[s, v].float() + 1.0) / 2.0))
-        tiles += [voxel_image(batch.occupancy[s], TILE), voxel_image(found.occupancy[s], TILE)]
+            tiles.append(_grey((masks[s, v].float() + 1.0) / 2.0))
+        tiles += [voxel_image(batch.occupancy[s], TILE), voxel_image(occupancy[s], TILE)]
         rows.append(np.concatenate(tiles, axis=1))
     return np.concatenate(rows, axis=0)
 

@@ -1,1 +1,1 @@
-"""From a decoder's voxels to a closed coloured mesh, its files and its images. NumPy; no networks."""
+"""From a decoder's voxels to a watertight coloured mesh, its files and its images. NumPy; no networks."""

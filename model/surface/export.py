@@ -9,8 +9,8 @@ from jaxtyping import Float, Float32, Int
 from trimesh.exchange.gltf import export_glb
 from trimesh.exchange.ply import export_ply
 
-from model.surface.color import linear_from_srgb
 from model.surface.mesh import SurfaceMesh, vertex_normals
+from shards.color import linear_from_srgb
 
 __all__ = ["glb_bytes", "voxel_mesh", "voxels_ply"]
 
@@ -35,7 +35,7 @@ def glb_bytes(mesh: SurfaceMesh, T_objmesh_from_canonical: Float[np.ndarray, "4 
         faces=mesh.faces,
         vertex_normals=vertex_normals(mesh) @ ROTATION_YUP_FROM_OBJ.T,
         visual=trimesh.visual.TextureVisuals(material=material),
-        vertex_attributes={"_COLOR_0": linear_from_srgb(mesh.colors)},
+        vertex_attributes={"_COLOR_0": linear_from_srgb(np.clip(mesh.colors, 0.0, 1.0))},
         process=False,
     )
     return export_glb(shape, include_normals=True, tree_postprocessor=_name_colors)

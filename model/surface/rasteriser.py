@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int32, Int64, UInt8
 
 from model.errors import ModelError
-from model.surface.color import linear_from_srgb, srgb_from_linear
 from model.surface.mesh import SurfaceMesh, vertex_normals
+from shards.color import linear_from_srgb, srgb_from_linear
 
 __all__ = ["Raster", "RenderedMesh", "Shading", "rasterise", "render_mesh"]
 

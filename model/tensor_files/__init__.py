@@ -1,0 +1,1 @@
+"""Safetensors files, written whole or not at all."""

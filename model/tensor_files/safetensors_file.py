@@ -1,6 +1,5 @@
 """Safetensors files: written whole or not at all; read header first, tensors when they are known to fit."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from model.errors import ModelError
+from shards.storage.whole_file import write_whole
 
 __all__ = [
     "Header",
@@ -84,9 +84,8 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str,
     """The file appears whole or not at all; several processes may write the same."""
     path.parent.mkdir(parents=True, exist_ok=True)
     saved = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    save_file(saved, partial, metadata=metadata)
-    os.replace(partial, path)
+    with write_whole(path) as partial:
+        save_file(saved, partial, metadata=metadata)
 
 
 def read_header(path: Path, *, expected: str, action: str) -> Header:

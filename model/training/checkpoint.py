@@ -3,7 +3,7 @@
 RUN/checkpoints/step-00001200/weights.safetensors    trained parameters and buffers
                               average.safetensors    their moving average: what inference uses
                               optimizer.safetensors  "<parameter>/<quantity>"
-                              state.json             step, data position, configuration
+                              state.json             step, data position, configuration, machine
 """
 
 import json
@@ -19,6 +19,7 @@ from torch import nn
 
 from model.errors import ModelError
 from model.training.ema import MovingAverage
+from model.training.precision import Machine
 
 __all__ = [
     "TrainingState",
@@ -31,14 +32,14 @@ __all__ = [
     "save_checkpoint",
 ]
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 _NAME = re.compile(r"step-(\d{8})")
 _PARTIAL = re.compile(r"\.step-\d{8}\.partial")
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingState:
-    """Where a run stands, apart from tensors. Randomness is a function of the step (`draws.py`)."""
+    """Where a run stands, apart from tensors. Randomness is a function of the step (`step_generators.py`)."""
 
     step: int
     epoch: int
@@ -46,6 +47,7 @@ class TrainingState:
     config_yaml: str
     config_sha256: str
     data_sha256: str  # of what is read, wherever it lies
+    machine: Machine  # that the last step ran on
     format_version: int = FORMAT_VERSION
 
 
@@ -146,7 +148,9 @@ def read_state(path: Path) -> TrainingState:
     try:
         content = json.loads((path / "state.json").read_text(encoding="utf-8"))
         version = content["format_version"]
-        state = TrainingState(**content) if version == FORMAT_VERSION else None
+        state = None
+        if version == FORMAT_VERSION:
+            state = TrainingState(**content | {"machine": Machine(**content["machine"])})
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise ModelError(
             path,

@@ -2,7 +2,8 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+
+from model.training.precision import Precision
 
 __all__ = ["OptimizerConfig", "TrainerConfig"]
 
@@ -34,7 +35,7 @@ class TrainerConfig:
     seed: int
     steps: int
     accumulate: int  # batches per optimiser step
-    precision: Literal["float32", "bfloat16"]
+    precision: Precision
     ema_decay: float
     checkpoint_every: int
     keep_checkpoints: int

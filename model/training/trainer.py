@@ -26,19 +26,30 @@ from model.training.checkpoint import (
     delete_partial,
     latest_checkpoint,
     load_checkpoint,
+    read_state,
     save_checkpoint,
 )
 from model.training.clock import Clock
 from model.training.config import OptimizerConfig, TrainerConfig
 from model.training.ema import MovingAverage
+from model.training.precision import UsedPrecision, changes, this_machine, used_precision
 from model.training.step_generators import sample_generators
 from model.training.task import Evaluation, Losses, Task
 
-__all__ = ["BatchSource", "NonFiniteLossError", "PlacedBatch", "StepReport", "TrainingStopped", "train"]
+__all__ = [
+    "BatchSource",
+    "NonFiniteLossError",
+    "PlacedBatch",
+    "RunStarted",
+    "StepReport",
+    "TrainingEvent",
+    "TrainingStopped",
+    "train",
+]
 
 
 class NonFiniteLossError(RuntimeError):
-    """The loss became NaN or infinite; the message names the samples and where training can go on."""
+    """The loss became NaN or infinite; the message names motions, clips and frames, and where training can go on."""
 
 
 class TrainingStopped(Exception):  # noqa: N818  (no error: the run was asked to stop and is saved)
@@ -68,8 +79,17 @@ class BatchSource(Protocol):
 
 
 @dataclass(frozen=True, kw_only=True)
+class RunStarted:
+    """The first step is about to be made."""
+
+    step: int  # finished steps: above 0 when a run is resumed
+    steps: int
+    notices: tuple[str, ...]  # what the user should read once
+
+
+@dataclass(frozen=True, kw_only=True)
 class StepReport:
-    """One optimiser step, for progress bars and logs."""
+    """One optimiser step, for progress bars."""
 
     step: int  # finished steps
     steps: int
@@ -77,7 +97,10 @@ class StepReport:
     learning_rate: float
     gradient_norm: float
     samples_per_s: float
-    waiting_share: float  # of the time since the last report spent waiting for data
+    waiting_share: float  # of the time since the last logged step spent waiting for data
+
+
+TrainingEvent = RunStarted | StepReport
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,6 +116,7 @@ class _Run:
     average: MovingAverage
     writer: SummaryWriter | None
     checkpoints: Path
+    precision: UsedPrecision
 
 
 def train(
@@ -105,27 +129,35 @@ def train(
     config_yaml: str,
     config_sha256: str,
     validate: Callable[[], Evaluation] | None = None,
-    report: Callable[[StepReport], None] | None = None,
+    report: Callable[[TrainingEvent], None] | None = None,
     accelerator: Accelerator | None = None,
 ) -> TrainingState:
     """Train to the end, from the newest checkpoint in `folder` if there is one.
 
-    `validate` is called with the averaged weights in place. Raises NonFiniteLossError, and
+    `validate` is called with the averaged weights in place; `report` before the first step and after each one, on the
+    main process. Raises NonFiniteLossError, and
     TrainingStopped after SIGTERM; both leave a checkpoint to resume from. However it ends, the log is
     written and the loader processes are gone.
     """
     accelerator = accelerator or Accelerator()
-    run = _prepare(task, config, optimizer_config, accelerator, folder)
-    begin = TrainingState(
+    checkpoints = folder / "checkpoints"
+    newest = _newest_checkpoint(checkpoints, accelerator)
+    precision, notices = _agreed_precision(config, newest, accelerator)
+    run = _prepare(task, config, optimizer_config, accelerator, folder, precision)
+    state = TrainingState(
         step=0,
         epoch=0,
         samples_consumed=0,
         config_yaml=config_yaml,
         config_sha256=config_sha256,
         data_sha256=source.data_sha256,
+        machine=this_machine(accelerator.device, precision),
     )
     try:
-        state = _newest_state(run, begin)
+        if newest is not None:
+            state = _restored(run, newest, state)
+        if report is not None and accelerator.is_main_process:
+            report(RunStarted(step=state.step, steps=config.steps, notices=notices))
         with _StopFlag() as stop, closing(source.batches(state.epoch, state.samples_consumed)) as batches:
             return _loop(run, batches, state, validate, report, stop)
     finally:
@@ -133,24 +165,43 @@ def train(
             run.writer.close()
 
 
-def _newest_state(run: _Run, begin: TrainingState) -> TrainingState:
-    """That of the newest checkpoint, with everything restored from it, or `begin` where there is none."""
+def _newest_checkpoint(folder: Path, accelerator: Accelerator) -> Path | None:
+    """The same on every rank."""
     newest: list[Path | None] = [None]
-    if run.accelerator.is_main_process:
-        delete_partial(run.checkpoints)
-        newest = [latest_checkpoint(run.checkpoints)]
+    if accelerator.is_main_process:
+        delete_partial(folder)
+        newest = [latest_checkpoint(folder)]
     broadcast_object_list(newest)
-    if newest[0] is None:
-        return begin
+    return newest[0]
+
+
+def _agreed_precision(
+    config: TrainerConfig, newest: Path | None, accelerator: Accelerator
+) -> tuple[UsedPrecision, tuple[str, ...]]:
+    """The precision that the main process finds, for all ranks; and what is to be said of it."""
+    agreed: list[tuple[UsedPrecision, tuple[str, ...]] | None] = [None]
+    if accelerator.is_main_process:
+        recorded = read_state(newest).machine if newest is not None else None
+        precision, line = used_precision(config.precision, accelerator.device, recorded)
+        changed = changes(recorded, this_machine(accelerator.device, precision)) if recorded else None
+        agreed = [(precision, (line,) if changed is None else (line, changed))]
+    broadcast_object_list(agreed)
+    assert agreed[0] is not None  # the main process has set it
+    return agreed[0]
+
+
+def _restored(run: _Run, newest: Path, begin: TrainingState) -> TrainingState:
+    """The state of a checkpoint, with everything restored from it."""
     state = load_checkpoint(
-        newest[0],
+        newest,
         run.task.module,
         run.average,
         run.optimizer,
         config_sha256=begin.config_sha256,
         data_sha256=begin.data_sha256,
     )
-    return replace(state, config_yaml=begin.config_yaml)  # the bookkeeping and the places of now
+    # The bookkeeping, the places and the machine of now.
+    return replace(state, config_yaml=begin.config_yaml, machine=begin.machine)
 
 
 def _prepare(
@@ -159,6 +210,7 @@ def _prepare(
     optimizer_config: OptimizerConfig,
     accelerator: Accelerator,
     folder: Path,
+    precision: UsedPrecision,
 ) -> _Run:
     task.module.to(accelerator.device)
     parameters = [parameter for parameter in task.module.parameters() if parameter.requires_grad]
@@ -182,6 +234,7 @@ def _prepare(
         average=MovingAverage(task.module, config.ema_decay),
         writer=SummaryWriter(folder / "tensorboard") if accelerator.is_main_process else None,
         checkpoints=folder / "checkpoints",
+        precision=precision,
     )
 
 
@@ -190,7 +243,7 @@ def _loop(
     batches: Iterator[PlacedBatch],
     state: TrainingState,
     validate: Callable[[], Evaluation] | None,
-    report: Callable[[StepReport], None] | None,
+    report: Callable[[TrainingEvent], None] | None,
     stop: "_StopFlag",
 ) -> TrainingState:
     config = run.config
@@ -202,9 +255,13 @@ def _loop(
         state = replace(
             state, step=state.step + 1, epoch=placed.epoch, samples_consumed=placed.samples_consumed
         )
-        if state.step % config.log_every == 0 or state.step == config.steps:
-            _log(run, state.step, losses, norm, rate, clock, report)
         done = state.step == config.steps
+        made = _step_report(run, state.step, losses, norm, rate, clock)
+        if state.step % config.log_every == 0 or done:
+            _log(run, made)
+            clock.restart()
+        if report is not None and run.accelerator.is_main_process:
+            report(made)
         if validate is not None and (state.step % config.validate_every == 0 or done):
             _validate(run, state.step, validate)
             clock.pause()
@@ -214,7 +271,7 @@ def _loop(
             saved_step = state.step
             clock.pause()
         if asked_to_stop and not done:
-            raise TrainingStopped(f"stopped after step {state.step} of {config.steps}; run again to go on")
+            raise TrainingStopped(f"stopped after step {state.step} of {config.steps}; run again to resume")
     return state
 
 
@@ -224,18 +281,18 @@ def _step(
     """One optimiser step over `accumulate` global batches."""
     config, accelerator = run.config, run.accelerator
     sums: dict[str, torch.Tensor] = {}
-    ids: list[str] = []
+    names: list[str] = []
     placed: PlacedBatch | None = None
     for part in range(config.accumulate):
         with clock.waiting():
             placed = next(batches)
         batch = placed.batch.to(accelerator.device, torch.float32)
         generators = sample_generators(config.seed, step * config.accumulate + part, placed.places)
-        bfloat16 = config.precision == "bfloat16"
+        bfloat16 = run.precision == "bfloat16"
         with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=bfloat16):
             losses = run.task.loss(batch, generators)
         _require_finite(run, losses, batch, step)
-        ids += batch.ids
+        names += batch.names
         (losses.total / config.accumulate).backward()
         for name, value in {"loss": losses.total, **losses.parts}.items():
             sums[name] = sums.get(name, 0.0) + value.detach().float() / config.accumulate
@@ -246,7 +303,7 @@ def _step(
     if not bool(torch.isfinite(norm)):  # the same on all ranks; before it reaches weights and checkpoints
         raise NonFiniteLossError(
             f"step {step}: the gradient is {float(norm)} though the loss is finite; samples of this rank: "
-            f"{', '.join(ids)}; expected a finite number. Look at these samples, or lower optimizer.learning_rate; "
+            f"{', '.join(names)}; expected a finite number. Look at these samples, or lower optimizer.learning_rate; "
             f"training resumes from the newest checkpoint in {run.checkpoints}"
         )
     rate = run.optimizer_config.rate(step, config.steps)
@@ -278,7 +335,7 @@ def _require_finite(run: _Run, losses: Losses, batch: Batch, step: int) -> None:
     if not _any(run.accelerator, bad):
         return
     parts = ", ".join(f"{name} {float(value.detach()):.4g}" for name, value in losses.parts.items())
-    whose = f"samples {', '.join(batch.ids)}" if bad else "samples of another rank (see its message)"
+    whose = f"samples {', '.join(batch.names)}" if bad else "samples of another rank (see its message)"
     raise NonFiniteLossError(
         f"step {step}: the loss is {float(losses.total.detach())} ({parts}) for {whose}; expected a finite number. "
         f"Look at these samples, or lower optimizer.learning_rate; training resumes from the newest checkpoint "
@@ -302,16 +359,10 @@ def _validate(run: _Run, step: int, validate: Callable[[], Evaluation]) -> None:
             run.writer.add_image(f"validation/{name}", image, step, dataformats="HWC")
 
 
-def _log(
-    run: _Run,
-    step: int,
-    losses: dict[str, float],
-    norm: float,
-    rate: float,
-    clock: Clock,
-    report: Callable[[StepReport], None] | None,
-) -> None:
-    made = StepReport(
+def _step_report(
+    run: _Run, step: int, losses: dict[str, float], norm: float, rate: float, clock: Clock
+) -> StepReport:
+    return StepReport(
         step=step,
         steps=run.config.steps,
         losses=losses,
@@ -320,16 +371,17 @@ def _log(
         samples_per_s=clock.samples_per_s(),
         waiting_share=clock.waiting_share(),
     )
-    clock.restart()
-    if run.writer is not None:
-        for name, value in losses.items():
-            run.writer.add_scalar(f"training/{name}", value, step)
-        run.writer.add_scalar("training/learning_rate", rate, step)
-        run.writer.add_scalar("training/gradient_norm", norm, step)
-        run.writer.add_scalar("speed/samples_per_s", made.samples_per_s, step)
-        run.writer.add_scalar("speed/waiting_share", made.waiting_share, step)
-    if report is not None and run.accelerator.is_main_process:
-        report(made)
+
+
+def _log(run: _Run, made: StepReport) -> None:
+    if run.writer is None:
+        return
+    for name, value in made.losses.items():
+        run.writer.add_scalar(f"training/{name}", value, made.step)
+    run.writer.add_scalar("training/learning_rate", made.learning_rate, made.step)
+    run.writer.add_scalar("training/gradient_norm", made.gradient_norm, made.step)
+    run.writer.add_scalar("speed/samples_per_s", made.samples_per_s, made.step)
+    run.writer.add_scalar("speed/waiting_share", made.waiting_share, made.step)
 
 
 def _save(run: _Run, state: TrainingState) -> None:

@@ -9,8 +9,9 @@ from model.errors import ModelError
 from model.video.frame_choice import FrameChoice, choose_frames
 from model.video.frames import ReadLimits, VideoFrames
 from model.video.image_files import IMAGE_SUFFIXES, read_images
-from model.video.shard_clip import read_clip, shards_at
+from model.video.shard_clip import read_clip
 from model.video.video_file import read_video
+from shards.reader import open_shards
 
 __all__ = ["read_frames", "read_informative_frames"]
 
@@ -74,8 +75,8 @@ def _refuse_dataset(source: str, files: Sequence[Path]) -> None:
     """ModelError that names a clip, for a dataset or shard without a clip."""
     if not {"dataset.json", "shard.json"} & {file.name for file in files}:
         return
-    clips = [clip for shard in shards_at(source) for clip in shard.record.clip_ids]
-    example = f"For example '{source.rstrip('/')}#{clips[0]}'." if clips else "It has no finished clip yet."
+    clips = [clip for shard in open_shards(source) for clip in shard.record.clip_ids]
+    example = f"For example '{source.rstrip('/')}#{clips[0]}'." if clips else "All its motions were skipped."
     raise ModelError(
         source,
         f"this is a dataset with {len(clips)} clips",

@@ -1,13 +1,7 @@
 """Frames of a clip of a dataset: the same images that a video of it would show, and nothing else."""
 
 from collections.abc import Sequence
-from difflib import get_close_matches
 
-import numpy as np
-from jaxtyping import Float
-
-from model.data.crop import union_box
-from model.errors import ModelError
 from model.video.frames import (
     ReadLimits,
     VideoFrame,
@@ -16,20 +10,19 @@ from model.video.frames import (
     even_positions,
     scaled_down,
 )
-from shards.reader import Shard, open_dataset, open_shard
+from shards.reader import find_clip, open_shards
 
-__all__ = ["annotated_boxes", "read_clip", "shards_at"]
-
-_BOXES = ("hand_box_visible_px", "object_box_amodal_px")
+__all__ = ["read_clip"]
 
 
 def read_clip(address: str, clip_id: str, limits: ReadLimits, indices: Sequence[int] | None) -> VideoFrames:
     """The frames `indices` of a clip, or candidates spread over it. `address`: a dataset or a shard.
 
-    Raises ModelError for an unknown clip or frame, ShardError for damaged data.
+    Raises ModelError for an unknown frame, ShardError for an unknown clip or damaged data.
     """
     source = f"{address}#{clip_id}"
-    frames = _shard_of(address, clip_id).read_frames(clip_id, ("rgb", "time_s"))
+    shard = find_clip(open_shards(address), clip_id, where=address)
+    frames = shard.read_frames(clip_id, ("rgb", "time_s"))
     n = len(frames)
     wanted = even_positions(n, limits.max_frames)
     if indices is not None:
@@ -53,33 +46,3 @@ def read_clip(address: str, clip_id: str, limits: ReadLimits, indices: Sequence[
             )
         )
     return VideoFrames(source=source, kind="clip", frames=tuple(images), n_source_frames=n, notes=())
-
-
-def annotated_boxes(address: str, clip_id: str, frames: VideoFrames) -> Float[np.ndarray, "frame 4"]:
-    """Annotated boxes of visible hand and amodal object together, image pixels, for each of `frames`.
-
-    Truth that a user's video does not have: only for evaluations that give it to every method.
-    """
-    table = _shard_of(address, clip_id).read_frames(clip_id, _BOXES)
-    boxes = []
-    for frame in frames.frames:
-        box = union_box(np.stack([table[name][frame.index] for name in _BOXES]), frame.source_size)
-        boxes.append(box * np.tile(np.divide(frame.image_size, frame.source_size), 2))
-    return np.stack(boxes)
-
-
-def shards_at(address: str) -> tuple[Shard, ...]:
-    """Finished shards of a dataset, or the one shard that `address` names. Raises ShardError."""
-    name = address.rstrip("/").rsplit("/", 1)[-1]
-    return (open_shard(address),) if name.startswith("shard-") else open_dataset(address).shards
-
-
-def _shard_of(address: str, clip_id: str) -> Shard:
-    shards = shards_at(address)
-    for shard in shards:
-        if clip_id in shard.record.clip_ids:
-            return shard
-    known = [clip for shard in shards for clip in shard.record.clip_ids]
-    close = get_close_matches(clip_id, known, n=1)
-    hint = f"Did you mean '{close[0]}'?" if close else f"The first one is '{known[0] if known else ''}'."
-    raise ModelError(address, f"no clip '{clip_id}'", expected=f"one of its {len(known)} clips", action=hint)

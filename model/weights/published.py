@@ -205,7 +205,7 @@ def _require_complete(network: PublishedNetwork, file: ImportedFile, key_list: P
     if file.keys.complete:
         return
     if _shapes(file.path, network) == network.shapes:
-        action = "The file is the published one: import it with configs/model/paper*.yaml."
+        action = "The file is the published one: import it with --config paper or paper_slat."
     else:
         action = f"Every key is in {key_list}; give the unmodified {network.name}_fp16.safetensors."
     count = len(file.keys.used) + len(file.keys.missing) + len(file.keys.mismatched)

@@ -1,0 +1,1 @@
+"""The files below the rows: Parquet, PNG, OpenEXR."""

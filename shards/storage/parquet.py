@@ -30,8 +30,8 @@ from shards.errors import (
     StorageError,
     TruncatedError,
 )
-from shards.records import FileRecord
 from shards.schema import CONVENTIONS, SCHEMA_VERSION
+from shards.storage.records import FileRecord
 
 __all__ = ["COPY_AGAIN", "ParquetSource", "file_metadata", "file_record", "local_source", "parquet_writer"]
 

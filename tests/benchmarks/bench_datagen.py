@@ -14,7 +14,7 @@ import yaml
 from datagen.annotation.annotate import MotionGeometry, annotate_frame
 from datagen.config import load_config
 from datagen.jobs.plan_dataset import plan_dataset
-from datagen.jobs.render_motion import RENDER_SCRIPT, Job, sampled_motion
+from datagen.jobs.render_motion import RENDERER, Job, sampled_motion
 from datagen.processes.phase_timer import PhaseTimer
 from datagen.scene.scene import Scene
 from datagen.scene.scene_file import save_scene
@@ -103,7 +103,7 @@ def test_resident_memory_over_500_frames(tmp_path, say):
     data["sampling"]["render"] |= {"samples": 1}
     path.write_text(yaml.safe_dump(data))
     save_scene(sampled_scene(tmp_path, path), tmp_path / "scene.npz")
-    command = [sys.executable, str(RENDER_SCRIPT), "--scene", str(tmp_path / "scene.npz"), "--device", "cpu"]
+    command = [*RENDERER, "--scene", str(tmp_path / "scene.npz"), "--device", "cpu"]
     rss_mb = []
     with subprocess.Popen(
         [*command, "--frames-dir", str(tmp_path / "frames")],

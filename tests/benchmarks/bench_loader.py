@@ -155,7 +155,6 @@ def decoded(stored: Stored, rng: np.random.Generator) -> TrainingSample:
     sample = TrainingSample(
         motion_id="",
         object_uid="",
-        split="train",
         clip_ids=("",) * VIEWS,
         frame_indices=np.zeros(VIEWS, int),
         images=images,

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 import yaml
 
+from datagen.config import config_as_yaml, read_config
 from datagen.grasps.config import GraspConfig
 from datagen.grasps.synthesis.synthesise import synthesise_grasp
 from datagen.hands.model import HandModel, shape_hand
@@ -39,8 +40,8 @@ def write_inputs(folder: Path, *, sequences: int = 2) -> None:
 
 
 def write_config(folder: Path, change: Callable[[dict[str, Any]], object] | None = None) -> Path:
-    """graspxl.yaml on the inputs in `folder`, after `change` has had its way."""
-    config = yaml.safe_load((ROOT / "configs" / "datagen" / "graspxl.yaml").read_text())
+    """The preset graspxl on the inputs in `folder`, after `change` has had its way."""
+    config = yaml.safe_load(config_as_yaml(read_config("graspxl")))
     config["motions"]["graspxl_root"] = str(folder / "graspxl")
     config["objects"] |= {"objaverse_root": str(folder / "store"), "cache_dir": str(folder / "cache")}
     config["hand"] |= {"model": "open", "skin": "open"}

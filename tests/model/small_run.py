@@ -1,4 +1,4 @@
-"""configs/model/tiny.yaml with a hand encoder, cut down to seconds: two steps of each part, on a dataset of balls."""
+"""configs/model/tiny.yaml with a hand encoder, cut down to seconds: two steps of each component, on balls."""
 
 from pathlib import Path
 from typing import Any
@@ -7,17 +7,16 @@ import yaml
 from click.testing import CliRunner
 
 from model.cli.main import main
+from model.recipes.config import read_settings
 
 ROOT = Path(__file__).resolve().parents[2]
-TINY = ROOT / "configs" / "model" / "tiny.yaml"
-HANDS = ROOT / "configs" / "model" / "hands.yaml"
 STEPS = 2
 
 
 def small_settings(dataset: Path) -> dict[str, Any]:
     """The content of the file, to be changed further."""
-    config = yaml.safe_load(TINY.read_text())
-    config["hand_encoder"] = yaml.safe_load(HANDS.read_text())["hand_encoder"]
+    config = read_settings("tiny").data
+    config["hand_encoder"] = read_settings("hands").data["hand_encoder"]
     config["encoders"] |= {"image": {"image_size": 64, "grid": 8}, "hand": {"own_grid": 8}}
     config["stage_one"]["network"]["masks"]["grid"] = 8
     config["data"] |= {
@@ -28,9 +27,9 @@ def small_settings(dataset: Path) -> dict[str, Any]:
     }
     config["validation"] |= {"views": 2, "batch_size": 2, "batches": 1}
     config["stage_one"]["sampler"]["steps"] = 2
-    for part in ("vae", "hand_encoder", "stage_one"):
-        recipe = config[part]["recipe"]
-        recipe |= {"batch_size": 2, "views": [1, 2]}
+    for component in ("vae", "hand_encoder", "stage_one"):
+        recipe = config[component]["recipe"]
+        recipe |= {"batch_size": 2} if component == "vae" else {"batch_size": 2, "views": [1, 2]}
         recipe["trainer"] |= {
             "steps": STEPS,
             "checkpoint_every": 1,

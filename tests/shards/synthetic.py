@@ -16,10 +16,10 @@ from shards.geometry import (
     project_points,
     transform_points,
 )
-from shards.records import DatasetRecord, MotionRecord, Provenance
 from shards.schema import CONVENTIONS, SCHEMA_VERSION, ClipRow, FrameRow, ObjectRow
 from shards.splits import SplitRule, split_of_object
 from shards.storage.images import MASK_BITS, encode_geometry, encode_masks, encode_rgb_png, mask_box_px
+from shards.storage.records import DatasetRecord, MotionRecord, Provenance
 from shards.writer import begin_dataset, commit_shard, stage_motion
 
 PROVENANCE = Provenance(generator_commit="0" * 40, config_sha256=hashlib.sha256(b"config").hexdigest())

@@ -1,12 +1,15 @@
-"""Reading needs NumPy, pyarrow, OpenEXR and fsspec: nothing more is imported, NumPy 1 or 2."""
+"""Reading needs NumPy, pyarrow, OpenEXR and fsspec: nothing more is imported, NumPy 1 or 2, any Python from 3.11."""
 
 import re
+import shutil
 import subprocess
 import sys
 import venv
 from pathlib import Path
 
 import pytest
+
+from tests.packaging.built_wheel import build_wheel, run_in
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "shards" / "README.md"
@@ -87,3 +90,33 @@ def test_a_fresh_environment_with_four_packages_reads(dataset_dir, tmp_path, req
     version = 2 if requirements is NEWEST else 1
     assert f"read with NumPy {version}." in run(python, BLOCK_AND_READ, dataset_dir)
     run(python, readme_example("plain", dataset_dir) + CHECK_PLAIN)
+
+
+def interpreter(minor: int) -> str | None:
+    """A Python 3.`minor` of this machine that runs: on the path, or among those of pyenv."""
+    name, pyenv = f"python3.{minor}", Path.home() / ".pyenv" / "versions"
+    for python in (shutil.which(name), *map(str, sorted(pyenv.glob(f"3.{minor}.*/bin/{name}")))):
+        # One of pyenv's shims is there for every version, and runs only the chosen one.
+        if python and subprocess.run([python, "-c", ""], capture_output=True, check=False).returncode == 0:
+            return python
+    return None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("minor", [11, 12, 13, 14])
+def test_the_wheel_alone_reads_on_every_python(dataset_dir, tmp_path, minor):
+    base = interpreter(minor)
+    if base is None:
+        pytest.skip(f"Python 3.{minor} is not on this machine")
+    subprocess.run([base, "-m", "venv", str(tmp_path / "env")], check=True)
+    python = tmp_path / "env" / "bin" / "python"
+    wheel = build_wheel(tmp_path / "wheel")
+    subprocess.run([python, "-m", "pip", "install", "-q", str(wheel)], check=True)
+    where = run_in(
+        tmp_path, python, "-c", "import sys, shards; print(sys.version_info.minor, shards.__file__)"
+    )
+    found, file = where.stdout.split()
+    assert int(found) == minor
+    assert Path(file).is_relative_to(tmp_path / "env")
+    read = run_in(tmp_path, python, "-c", BLOCK_AND_READ, dataset_dir)
+    assert "read with NumPy" in read.stdout, read.stderr

@@ -2,6 +2,7 @@
 
 import dataclasses
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,11 @@ from fsspec.implementations.local import LocalFileSystem
 
 from shards.columns import columns_of
 from shards.errors import DatasetNotFoundError, IncompleteShardError, MissingColumnError, SchemaVersionError
-from shards.reader import open_dataset, open_shard
-from shards.records import check_schema_version, write_record
+from shards.reader import find_clip, open_dataset, open_shard, open_shards
 from shards.schema import SCHEMA_VERSION, FrameRow
 from shards.storage.images import decode_masks
+from shards.storage.records import check_schema_version, write_record
+from shards.writer import begin_dataset
 from tests.shards.synthetic import PROVENANCE, stage_synthetic, synthetic_clip, synthetic_object
 
 
@@ -127,8 +129,64 @@ def test_unfinished_shards_do_not_exist(dataset_copy):
 def test_what_is_not_there_is_said_plainly(dataset_dir, tmp_path):
     with pytest.raises(DatasetNotFoundError, match=r"nowhere/dataset.json: no such file"):
         open_dataset(tmp_path / "nowhere")
-    with pytest.raises(DatasetNotFoundError, match=r"no such clip.*found x"):
-        open_dataset(dataset_dir).read_frames("x")
+    dataset = open_dataset(dataset_dir)
+    for place in (dataset, dataset.shards[0]):
+        with pytest.raises(DatasetNotFoundError, match=r"no such clip.*one of its 4 clips, found x"):
+            place.read_frames("x")
+    with pytest.raises(DatasetNotFoundError, match=r"is it 'motion-000001-camera-00'\?"):
+        dataset.shards[0].read_clip("motion-00001-camera-00")
+    with pytest.raises(DatasetNotFoundError, match=r"objects.parquet: no such object \(found ball-7\)"):
+        dataset.shards[0].read_object("ball-7", ["name"])
+
+
+def test_an_address_is_a_dataset_or_one_shard(dataset_dir, tmp_path):
+    folder = dataset_dir / "shards" / "shard-00000"
+    elsewhere = tmp_path / "my shard"  # a name says nothing
+    shutil.copytree(folder, elsewhere)
+    for url in (dataset_dir, f"{dataset_dir}/", folder, f"{folder}/", elsewhere):
+        (shard,) = open_shards(url)
+        assert shard.record == open_shard(folder).record
+    assert open_shard(folder).read_split_rule() == open_dataset(dataset_dir).record.split_rule
+    assert open_shard(elsewhere).read_split_rule() is None
+    begin_dataset(tmp_path / "empty", open_dataset(dataset_dir).record)
+    with pytest.raises(DatasetNotFoundError, match=r"empty: no finished shard .*make render SHARD=0"):
+        open_shards(tmp_path / "empty")
+    with pytest.raises(DatasetNotFoundError, match="no such file"):
+        open_shards(tmp_path / "nowhere")
+
+
+def test_rows_are_found_by_name(dataset_dir):
+    (shard,) = open_shards(dataset_dir)
+    for row in shard.objects():
+        table = shard.read_object(
+            row.object_uid, ["object_uid", "surface_points", "object_scale_m", "mesh_glb"]
+        )
+        assert len(table) == 1
+        assert table["object_uid"] == [row.object_uid]
+        assert table["mesh_glb"] == [row.mesh_glb]
+        np.testing.assert_array_equal(table["surface_points"][0], row.surface_points)
+        assert table["object_scale_m"].tolist() == [row.object_scale_m]
+        assert shard.has_object(row.object_uid)
+    assert not shard.has_object("ball")
+    for clip in shard.clips():
+        assert shard.read_clip(clip.clip_id).camera_index == clip.camera_index
+        assert find_clip([shard], clip.clip_id, where="here") is shard
+
+
+def test_of_an_object_only_the_named_columns_are_fetched(dataset_dir):
+    (plain,) = open_shards(dataset_dir)
+    fs = CountingFileSystem()
+    shard = dataclasses.replace(plain, fs=fs)
+    assert shard.has_object("ball-1")
+    source, fs.n_bytes = shard.source("objects"), 0
+    shard.read_object("ball-1", ["T_objmesh_from_canonical"])
+    group = source.metadata.row_group(1)
+    (chunk,) = (
+        chunk
+        for chunk in map(group.column, range(group.num_columns))
+        if chunk.path_in_schema.startswith("T_objmesh_from_canonical")
+    )
+    assert fs.n_bytes == chunk.total_compressed_size
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from shards.column_tables import update_readme
 from shards.columns import arrow_schema, columns_of, rows_from_table, table_from_rows
 from shards.errors import RowError
-from shards.schema import DIGITS, JOINTS, ROW_TYPES, ObjectRow
+from shards.schema import ROW_TYPES, ObjectRow
 from tests.shards.synthetic import synthetic_clip, synthetic_object
 
 README = Path(__file__).parents[2] / "shards" / "README.md"
@@ -43,13 +43,6 @@ def test_every_column_is_explained_in_the_file_itself(row_type):
     for field in arrow_schema(row_type):
         assert field.metadata[b"meaning"].endswith(b".") or b"." in field.metadata[b"meaning"], field.name
         assert {b"unit", b"frame"} <= field.metadata.keys()
-
-
-def test_joint_and_digit_names():
-    assert len(JOINTS) == 21
-    assert JOINTS[0] == "wrist"
-    assert JOINTS[13:16] == ("thumb1", "thumb2", "thumb3")
-    assert JOINTS[16:] == tuple(f"{digit}_tip" for digit in DIGITS)
 
 
 BALL = synthetic_object(0)

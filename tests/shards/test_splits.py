@@ -4,7 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from shards.splits import SplitRule, split_of_object
+from shards.errors import SplitError
+from shards.splits import ObjectSplits, SplitRule, identity_and_variant, object_identity, split_of_object
 
 RULE = SplitRule(val_fraction=0.1, test_fraction=0.1)
 
@@ -40,3 +41,45 @@ def test_a_larger_validation_set_takes_from_training_only(uid, test_fraction, va
 def test_impossible_fractions_are_refused(val_fraction, test_fraction):
     with pytest.raises(ValueError, match="split fractions"):
         SplitRule(val_fraction=val_fraction, test_fraction=test_fraction)
+
+
+@pytest.mark.parametrize(
+    ("uid", "identity", "variant"),
+    [
+        ("mug", "mug", ""),
+        ("store/mug@large-mirrored", "store/mug", "@large-mirrored"),
+        ("batch@1/mug", "batch@1/mug", ""),
+        ("batch@1/mug@large", "batch@1/mug", "@large"),
+        ("mug@a@b", "mug", "@a@b"),
+    ],
+)
+def test_a_variant_begins_at_the_first_at_sign_of_the_last_part(uid, identity, variant):
+    assert identity_and_variant(uid) == (identity, variant)
+    assert object_identity(uid) == identity
+
+
+@given(st.text("ab/@", max_size=12))
+def test_identity_and_variant_are_the_uid_and_variants_share_a_split(uid):
+    identity, variant = identity_and_variant(uid)
+    assert identity + variant == uid
+    assert split_of_object(uid, RULE) == split_of_object(identity, RULE)
+
+
+def test_one_object_in_two_splits_is_refused_with_both_places():
+    splits = ObjectSplits()
+    splits.add("store/mug@large", "train", where="shard A")
+    splits.add("store/mug", "train", where="shard B")
+    splits.add("store/mug2", "test", where="shard B")
+    with pytest.raises(SplitError) as caught:
+        splits.add("store/mug@small", "test", where="shard C")
+    assert str(caught.value).startswith(
+        "shard C: object 'store/mug' is in split test here and in train in shard A (expected each object in one split"
+    )
+
+
+def test_objects_of_different_folders_are_different_objects():
+    """Folders may have an "@" in their name: it begins no variant."""
+    splits = ObjectSplits()
+    splits.add("batch@1/mug", "train", where="a")
+    splits.add("batch@2/mug", "test", where="a")
+    splits.add("batch@1/cup", "val", where="a")

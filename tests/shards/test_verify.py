@@ -2,11 +2,13 @@
 
 import dataclasses
 import hashlib
+import shutil
 
 import numpy as np
 import pytest
 
 from shards.reader import open_shard
+from shards.splits import split_of_object
 from shards.storage.images import (
     MASK_BITS,
     Masks,
@@ -17,8 +19,14 @@ from shards.storage.images import (
     encode_rgb_png,
 )
 from shards.verify import verify_dataset, verify_shard
-from shards.writer import commit_shard, shard_dir, stage_motion
-from tests.shards.synthetic import PROVENANCE, SPLIT_RULE, synthetic_clip, synthetic_object
+from shards.writer import begin_dataset, commit_shard, shard_dir, stage_motion
+from tests.shards.synthetic import (
+    PROVENANCE,
+    SPLIT_RULE,
+    dataset_record,
+    synthetic_clip,
+    synthetic_object,
+)
 
 
 def test_a_good_dataset_has_no_findings(dataset_dir):
@@ -91,6 +99,7 @@ def test_objects(tmp_path, change, problem):
         (lambda row: {"has_table": True}, "has_table and table_top_z_m disagree"),
         (lambda row: {"rgb_codec": "jpeg"}, "rgb is not jpeg (frames 0, 1)"),
         (lambda row: {"image_width": 41}, "images of sizes"),
+        (lambda row: {"min_margin_px": 19.0}, "px of the border, min_margin_px says 19.00"),
     ],
 )
 def test_clips(tmp_path, change, problem):
@@ -171,6 +180,45 @@ def test_frames(tmp_path, change, problem):
 
 def test_small_numerical_noise_is_no_finding(tmp_path):
     assert findings(tmp_path, frames=lambda row: {"joints_px": row.joints_px + 0.005}) == ""
+
+
+def stage_two_splits(root, split_rule):
+    """Shard 0 and shard 1 with the same object, in another split the second time."""
+    begin_dataset(root, dataclasses.replace(dataset_record(), split_rule=split_rule))
+    for shard in (0, 1):
+        object_row = synthetic_object(0)
+        clip, frames = synthetic_clip(object_row, shard, 0, 2, 40)
+        split = clip.split if shard == 0 else other_split(clip.split)
+        stage_motion(
+            root, shard, shard, object_row=object_row, clips=[dataclasses.replace(clip, split=split)],
+            frames=frames, timings_s={}, provenance=PROVENANCE,
+        )  # fmt: skip
+        commit_shard(root, shard, motion_indices=[shard], provenance=PROVENANCE)
+
+
+def test_an_object_in_two_splits_is_found_over_all_shards(tmp_path):
+    stage_two_splits(tmp_path, SPLIT_RULE)
+    first, second = verify_dataset(tmp_path)
+    assert first.ok
+    truth = split_of_object("ball-0", SPLIT_RULE)
+    text = "\n".join(map(str, second.findings))
+    assert f"split: the rule says {truth}" in text
+    assert f"object 'ball-0' is in split {other_split(truth)} here and in {truth} in" in text
+
+
+def test_a_shard_of_a_dataset_is_held_against_its_rule_and_a_lone_one_is_not(tmp_path):
+    stage_two_splits(tmp_path / "set", SPLIT_RULE)
+    (in_place,) = verify_dataset(shard_dir(tmp_path / "set", 1))
+    assert "split: the rule says" in str(in_place.findings)
+    shutil.copytree(shard_dir(tmp_path / "set", 1), tmp_path / "alone")
+    (alone,) = verify_dataset(tmp_path / "alone")
+    assert alone.ok
+
+
+def test_progress_names_the_shard(dataset_dir):
+    steps = []
+    list(verify_dataset(dataset_dir, progress=lambda *step: steps.append(step)))
+    assert steps == [(0, i, 4) for i in range(5)]
 
 
 def test_a_damaged_file_is_found_once_and_by_name(dataset_copy):

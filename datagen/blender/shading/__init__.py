@@ -1,0 +1,1 @@
+"""Materials and textures: skin, sleeve, table tops, the held object."""

@@ -68,10 +68,6 @@ class Graph:
         """Vector from three numbers."""
         return self.node("ShaderNodeCombineXYZ", {0: x, 1: y, 2: z}).outputs[0]
 
-    def separate(self, vector: Input) -> tuple[bpy.types.NodeSocket, ...]:
-        """The three components of a vector."""
-        return tuple(self.node("ShaderNodeSeparateXYZ", {0: vector}).outputs)
-
     def attribute(self, name: str, output: str) -> bpy.types.NodeSocket:
         """A mesh attribute; `output` is "Vector", "Color" or "Fac"."""
         return self.node("ShaderNodeAttribute", {}, attribute_name=name).outputs[output]

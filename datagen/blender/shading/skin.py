@@ -9,6 +9,7 @@ from datagen.blender.shading.images import add_drawn_image, add_image, coded_nor
 from datagen.blender.shading.nodes import Graph, Input, new_material, surface
 from datagen.blender.shading.skin_relief import skin_relief, texel_size_m
 from datagen.scene.scene import ARM_SKIN, HAND_SKIN, HandLook, HandSurface
+from shards.color import linear_from_srgb
 
 __all__ = ["ARM_BLEND", "ARM_COLOR", "REST", "arm_color_and_blend", "skin_materials", "sleeve_material"]
 
@@ -164,5 +165,4 @@ def _sample(png: bytes, uv: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "
     small = decode_image(png, "skin colour").convert("RGB").resize((128, 128), Image.Resampling.BOX)
     srgb = np.asarray(small, np.float64)[::-1] / 255.0
     column, row = np.clip((uv * 128).astype(int), 0, 127).T
-    value = srgb[row, column]
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
+    return linear_from_srgb(srgb[row, column])

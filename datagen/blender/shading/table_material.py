@@ -2,12 +2,13 @@
 
 import bpy
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float
 
 from datagen.blender.shading.images import add_drawn_image, coded_normals
 from datagen.blender.shading.nodes import Input, new_material, surface
 from datagen.blender.shading.table_textures import draw_table
 from datagen.scene.scene import Table
+from shards.color import srgb_from_linear
 
 __all__ = ["table_material", "table_uv"]
 
@@ -16,7 +17,9 @@ def table_material(table: Table) -> bpy.types.Material:
     """Colour with roughness in its alpha, and a normal map: two look-ups per shading point."""
     textures = draw_table(table)
     material, graph = new_material(f"table {table.material}")
-    color_roughness = np.concatenate([_srgb(textures.color), textures.roughness[..., None]], axis=-1)
+    color_roughness = np.concatenate(
+        [srgb_from_linear(textures.color), textures.roughness[..., None]], axis=-1
+    )
     drawn = graph.image(add_drawn_image("table colour", color_roughness, is_color=True), extension="MIRROR")
     inputs: dict[str | int, Input] = {
         "Base Color": drawn.outputs["Color"],
@@ -45,9 +48,3 @@ def table_uv(
     outward = np.divide(outward, length, out=np.zeros_like(outward), where=length > 0.0)
     around = xy - outward * verts_table[:, 2:3]  # the top is z = 0, the side below it
     return ((around + half) / (2.0 * half))[faces]
-
-
-def _srgb(linear: Float32[np.ndarray, "row column 3"]) -> Float32[np.ndarray, "row column 3"]:
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055).astype(
-        np.float32
-    )

@@ -1,5 +1,5 @@
 """Images of table tops, drawn once per motion: sampling them costs Cycles a third of the same
-pattern as shader nodes (DECISIONS.md). Knows nothing of Blender; the same seed gives the same piece.
+pattern as shader nodes (DECISIONS D82). Knows nothing of Blender; the same seed gives the same piece.
 """
 
 from dataclasses import dataclass

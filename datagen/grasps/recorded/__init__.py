@@ -1,0 +1,1 @@
+"""GraspXL's recorded motions, replayed by MANO or by a hand that stands in."""

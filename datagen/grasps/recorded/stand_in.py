@@ -76,7 +76,7 @@ class StandInConfig:
                 raise ValueError(f"stand_in.{name} is {value}: expected a positive number")
 
 
-# Chosen on GraspXL's sample (metrics in DECISIONS.md).
+# Chosen on GraspXL's sample (DECISIONS D15).
 REFERENCE_STAND_IN = StandInConfig(
     grip_instants=5,
     grip_iterations=10,

@@ -1,0 +1,1 @@
+"""Grasps simulated with MuJoCo for any MANO-format hand and any object."""

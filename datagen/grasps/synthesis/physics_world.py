@@ -9,9 +9,10 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from datagen.grasps.config import GraspConfig
-from datagen.grasps.hand_body import DIGIT_BONES, DIGITS, HandBody
+from datagen.grasps.hand_body import HandBody
 from datagen.grasps.sequence import TableEdge
 from datagen.objects.asset.object_asset import ObjectAsset
+from shards.joints import DIGIT_JOINTS, DIGITS
 
 __all__ = ["GraspWorld", "HandContacts", "WristTarget"]
 
@@ -57,7 +58,7 @@ class HandContacts:
 
 DIGIT_OF_BONE = np.full(16, PALM)
 for _row, _digit in enumerate(DIGITS):
-    DIGIT_OF_BONE[list(DIGIT_BONES[_digit])] = _row
+    DIGIT_OF_BONE[list(DIGIT_JOINTS[_digit])] = _row
 
 
 def quaternion_wxyz(R: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n 4"]:
@@ -102,7 +103,7 @@ class GraspWorld:
         self.torque_nm = np.array([h.torque_nm for h in self.body.hinges])
         self.stiffness_nm = np.array([h.stiffness_nm for h in self.body.hinges])
         self.row_of_bone = DIGIT_OF_BONE
-        self.bones_of_digit = {digit: list(bones) for digit, bones in DIGIT_BONES.items()}
+        self.bones_of_digit = {digit: list(bones) for digit, bones in DIGIT_JOINTS.items()}
         self.low_rad = np.array([h.low_rad for h in self.body.hinges])
         self.high_rad = np.array([h.high_rad for h in self.body.hinges])
 
@@ -315,11 +316,11 @@ def _add_forearm(node: mujoco.MjsBody, body: HandBody, config: GraspConfig) -> N
 
 def _self_contact_bones() -> list[tuple[int, int]]:
     """Thumb against fingers, neighbouring fingers, finger ends against the palm."""
-    pairs = [(a, b) for a in (14, 15) for d in DIGITS[1:] for b in DIGIT_BONES[d]]
+    pairs = [(a, b) for a in (14, 15) for d in DIGITS[1:] for b in DIGIT_JOINTS[d]]
     for near, far in (("index", "middle"), ("middle", "ring"), ("ring", "pinky")):
-        for a in DIGIT_BONES[near][1:]:  # type: ignore[index]
-            pairs += [(a, b) for b in DIGIT_BONES[far][1:]]  # type: ignore[index]
-    pairs += [(0, DIGIT_BONES[d][2]) for d in DIGITS[1:]]
+        for a in DIGIT_JOINTS[near][1:]:
+            pairs += [(a, b) for b in DIGIT_JOINTS[far][1:]]
+    pairs += [(0, DIGIT_JOINTS[d][2]) for d in DIGITS[1:]]
     return pairs
 
 

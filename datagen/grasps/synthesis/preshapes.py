@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from datagen.grasps.hand_body import DIGITS, Digit, HandBody, bone_transforms
+from datagen.grasps.hand_body import HandBody, bone_transforms
+from shards.joints import DIGITS, Digit
 
 __all__ = ["PreshapeLibrary", "build_preshapes", "closing_rates"]
 

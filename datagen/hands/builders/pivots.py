@@ -16,12 +16,11 @@ from scipy.optimize import minimize
 
 from datagen.hands.builders.anthropometry import SEGMENT_FRACTIONS, hand_length
 from datagen.hands.builders.hand_arrays import (
-    DIGIT_JOINTS,
-    TIP_ORDER,
     HandArrays,
     digit_chain,
     fit_regressor_row,
 )
+from shards.joints import DIGIT_JOINTS, DIGITS
 
 __all__ = ["move_pivots"]
 
@@ -48,7 +47,7 @@ def move_pivots(hand: HandArrays) -> HandArrays:
     new_samples = samples + (warped - hand.v_template)
     regressor = hand.J_regressor.copy()
     for finger in FINGERS:
-        tips = samples[:, hand.tip_ids[TIP_ORDER.index(finger)]]
+        tips = samples[:, hand.tip_ids[DIGITS.index(finger)]]
         targets = _finger_targets(old_joints[:, list(DIGIT_JOINTS[finger])], tips, shifts[finger])
         axis = targets[1][0] - targets[0][0]
         for joint, target, depth in zip(DIGIT_JOINTS[finger], targets, PIVOT_DEPTHS):

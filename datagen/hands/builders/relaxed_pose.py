@@ -6,7 +6,8 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-from datagen.hands.builders.hand_arrays import DIGIT_JOINTS, HandArrays, digit_chain
+from datagen.hands.builders.hand_arrays import HandArrays, digit_chain
+from shards.joints import DIGIT_JOINTS
 
 __all__ = ["flexion_axis", "set_mean_pose"]
 

@@ -11,12 +11,12 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.hands.builders.hand_arrays import (
-    DIGIT_JOINTS,
     HandArrays,
     digit_chain,
     neighbour_mean,
     smoothstep,
 )
+from shards.joints import DIGIT_JOINTS
 
 __all__ = ["blend_weights"]
 

@@ -1,0 +1,1 @@
+"""ObjectAsset, one object ready for grasps and rendering, and its mirror image."""

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, WatertightMesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
+from shards.splits import identity_and_variant
 
 __all__ = ["is_mirrored", "mirrored_asset", "mirrored_uid", "unmirrored_uid"]
 
@@ -40,13 +41,14 @@ def mirrored_asset(asset: ObjectAsset) -> ObjectAsset:
 
 def mirrored_uid(uid: str) -> str:
     """ "a/b" -> "a/b@mirrored", "a/b@large" -> "a/b@large-mirrored"."""
-    return f"{uid}-{MIRRORED}" if "@" in uid else f"{uid}@{MIRRORED}"
+    _, variant = identity_and_variant(uid)
+    return f"{uid}-{MIRRORED}" if variant else f"{uid}@{MIRRORED}"
 
 
 def is_mirrored(uid: str) -> bool:
     """Whether the uid names a mirror image."""
-    _, at, variant = uid.rpartition("@")
-    return bool(at) and (variant == MIRRORED or variant.endswith(f"-{MIRRORED}"))
+    _, variant = identity_and_variant(uid)
+    return variant == f"@{MIRRORED}" or variant.endswith(f"-{MIRRORED}")
 
 
 def unmirrored_uid(uid: str) -> str:

@@ -1,0 +1,1 @@
+"""How the starter pack was made."""

@@ -1,0 +1,1 @@
+"""What is known of an object before its mesh is read: name, licence, annotation."""

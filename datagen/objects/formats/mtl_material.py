@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from datagen.objects.mesh.object_mesh import Material
-from datagen.objects.mesh.surface_points import linear_from_srgb
+from shards.color import linear_from_srgb
 
 __all__ = ["MtlEntry", "material_from_mtl"]
 

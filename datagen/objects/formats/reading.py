@@ -18,7 +18,7 @@ from datagen.objects.gltf.container import MAX_FILE_MB
 from datagen.objects.gltf.scene import read_gltf
 from datagen.objects.mesh.file_mesh import FileMesh
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
-from datagen.objects.mesh.surface_points import linear_from_srgb
+from shards.color import linear_from_srgb
 
 __all__ = ["MESH_SUFFIXES", "ReadObject", "ReadingConfig", "object_mesh", "read_object"]
 

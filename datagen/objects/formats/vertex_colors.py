@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from datagen.objects.mesh.surface_points import srgb_from_linear
+from shards.color import srgb_from_linear
 
 __all__ = ["baked_vertex_colors"]
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from datagen.objects.mesh.surface_points import linear_from_srgb, srgb_from_linear
+from shards.color import linear_from_srgb, srgb_from_linear
 
 __all__ = ["MetallicRoughness", "SpecularGloss", "metallic_roughness"]
 

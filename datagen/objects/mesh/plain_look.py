@@ -15,7 +15,8 @@ from jaxtyping import Float
 from PIL import Image
 
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
-from datagen.objects.mesh.surface_points import face_normals, linear_from_srgb, srgb_from_linear
+from datagen.objects.mesh.surface_points import face_normals
+from shards.color import linear_from_srgb, srgb_from_linear
 
 __all__ = ["with_plain_look"]
 

@@ -8,15 +8,14 @@ from jaxtyping import Float, Int
 from PIL import Image
 
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from shards.color import linear_from_srgb, srgb_from_linear
 
 __all__ = [
     "SurfaceSamples",
     "colors_at",
     "face_areas",
     "face_normals",
-    "linear_from_srgb",
     "sample_surface",
-    "srgb_from_linear",
 ]
 
 
@@ -29,17 +28,6 @@ class SurfaceSamples:
     colors: Float[np.ndarray, "point 3"]
     neighbour_colors: Float[np.ndarray, "point 3"]  # `jitter_m` away in the same plane
     face: Int[np.ndarray, " point"]
-
-
-def linear_from_srgb(srgb: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-    """IEC 61966-2-1 decoding, 0..1."""
-    return np.where(srgb <= 0.04045, srgb / 12.92, ((np.maximum(srgb, 0.0) + 0.055) / 1.055) ** 2.4)
-
-
-def srgb_from_linear(linear: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-    """IEC 61966-2-1 encoding, 0..1."""
-    linear = np.clip(linear, 0.0, 1.0)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def _doubled_area_normals(

@@ -1,0 +1,1 @@
+"""Where objects come from: the starter pack, folders, Sweet Home 3D, Objaverse, GraspXL."""

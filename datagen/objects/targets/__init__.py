@@ -1,0 +1,1 @@
+"""Learning targets: occupancy, surface samples, signed distances."""

@@ -1,0 +1,1 @@
+"""A watertight surface for any mesh, and its convex parts."""

@@ -2,7 +2,6 @@
 
 import hashlib
 import io
-import os
 import zipfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from datagen.objects.watertight.watertight_mesh import (
     signed_distance,
     watertight_surface,
 )
+from shards.storage.whole_file import write_whole
 
 __all__ = [
     "REFERENCE_PREPARATION",
@@ -151,9 +151,8 @@ def cached_watertight(
     # Made from bytes in both cases, so the first load and later ones are equal bit-exactly.
     data = watertight_to_bytes(make_watertight(mesh, config, source=source, with_parts=with_parts))
     cache_dir.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(f".{os.getpid()}.partial")
-    partial.write_bytes(data)
-    partial.replace(path)
+    with write_whole(path) as partial:
+        partial.write_bytes(data)
     return watertight_from_bytes(data)
 
 

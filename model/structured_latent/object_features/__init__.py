@@ -1,0 +1,1 @@
+"""What the SLat encoder reads of an object: features on its active voxels."""

@@ -15,9 +15,7 @@ from jaxtyping import Float, Float32, Int32, UInt8
 from model.errors import ModelError
 from model.surface.export import ROTATION_YUP_FROM_OBJ
 from shards.errors import DatasetNotFoundError
-from shards.reader import ColumnTable, Shard
-from shards.schema import ObjectRow
-from shards.storage.parquet import ParquetSource
+from shards.reader import Shard
 
 __all__ = ["MeshRecord", "ObjectMeshes", "TexturedMesh", "textured_mesh"]
 
@@ -71,23 +69,20 @@ class MeshRecord:
     object_uid: str
     mesh_sha256: str
     T_objmesh_from_canonical: Float[np.ndarray, "4 4"]
-    source: ParquetSource
-    group: int
+    shard: Shard
 
     def read(self) -> TexturedMesh:
         """ModelError where the shard may not hold the mesh, or where it is broken; ShardError."""
-        where = f"{self.source.path}: object {self.object_uid}"
-        table = self.source.read_row_group(self.group, ["object_uid", "mesh_glb"])
-        row = table["object_uid"].to_pylist().index(self.object_uid)
-        glb = table["mesh_glb"][row].as_py()
+        table = self.shard.read_object(self.object_uid, ["mesh_glb"])
+        (glb,) = table["mesh_glb"]
         if glb is None:
             raise ModelError(
-                where,
+                table.where,
                 "has no mesh: its licence forbids copies",
                 expected="mesh_glb, of which features of views are made",
                 action="Leave its shard out, give the cache folder where its features are, or use features: {}.",
             )
-        return textured_mesh(glb, self.T_objmesh_from_canonical, where=where)
+        return textured_mesh(glb, self.T_objmesh_from_canonical, where=table.where)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -96,37 +91,26 @@ class ObjectMeshes:
 
     shards: Sequence[Shard]
     _found: dict[str, MeshRecord] = field(default_factory=dict, init=False)
-    _searched: list[str] = field(default_factory=list, init=False)
 
     def record(self, object_uid: str) -> MeshRecord:
         """Of the first shard that has the object. DatasetNotFoundError, ShardError."""
-        for shard in self.shards[len(self._searched) :]:
-            if object_uid in self._found:
-                break
-            self._search(shard)
         if object_uid not in self._found:
+            self._found[object_uid] = self._search(object_uid)
+        return self._found[object_uid]
+
+    def _search(self, object_uid: str) -> MeshRecord:
+        shard = next((shard for shard in self.shards if shard.has_object(object_uid)), None)
+        if shard is None:
             raise DatasetNotFoundError(
                 "no such object", where=", ".join(shard.path for shard in self.shards), found=object_uid
             )
-        return self._found[object_uid]
-
-    def _search(self, shard: Shard) -> None:
-        source = shard.source("objects")
-        names = ["object_uid", "mesh_sha256", "T_objmesh_from_canonical"]
-        for group in range(source.num_row_groups):
-            table = ColumnTable(source.read_row_group(group, names), ObjectRow, where=source.path)
-            for row, uid in enumerate(table["object_uid"]):
-                self._found.setdefault(
-                    uid,
-                    MeshRecord(
-                        object_uid=uid,
-                        mesh_sha256=table["mesh_sha256"][row],
-                        T_objmesh_from_canonical=table["T_objmesh_from_canonical"][row],
-                        source=source,
-                        group=group,
-                    ),
-                )
-        self._searched.append(shard.path)
+        table = shard.read_object(object_uid, ["mesh_sha256", "T_objmesh_from_canonical"])
+        return MeshRecord(
+            object_uid=object_uid,
+            mesh_sha256=table["mesh_sha256"][0],
+            T_objmesh_from_canonical=table["T_objmesh_from_canonical"][0],
+            shard=shard,
+        )
 
 
 def _part(scene: trimesh.Scene, node: str) -> TexturedMesh:

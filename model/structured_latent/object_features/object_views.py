@@ -13,8 +13,8 @@ from jaxtyping import Float, Float32, Int, UInt8
 from scipy.stats import qmc
 
 from model.structured_latent.object_features.object_mesh import TexturedMesh
-from model.surface.color import linear_from_srgb, srgb_from_linear
 from model.surface.rasteriser import rasterise
+from shards.color import linear_from_srgb, srgb_from_linear
 from shards.geometry import intrinsics_from_fov, look_at
 
 __all__ = ["RENDERING", "ObjectView", "object_views", "sphere_cameras"]

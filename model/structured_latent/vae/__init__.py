@@ -1,0 +1,1 @@
+"""The VAE of structured latents: encoder, surface decoder, loss."""

@@ -1,7 +1,6 @@
 """Geometry buffers against Cycles' own passes."""
 
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,9 @@ from datagen.annotation.annotate import (
     MotionGeometry,
     annotate_frame,
 )
+from datagen.jobs.render_motion import RENDERER
 from datagen.scene.scene_file import save_scene
 from tests.datagen.annotation.annotated_scenes import make_hand_scene
-
-RENDER_SCRIPT = Path(__file__).resolve().parents[3] / "blender_scripts" / "render_scene.py"
 
 
 @pytest.mark.blender
@@ -27,7 +25,7 @@ def test_buffers_agree_with_the_passes_of_cycles(tmp_path):
     pytest.importorskip("bpy")
     scene, _ = make_hand_scene((256, 192))
     save_scene(scene, tmp_path / "scene.npz")
-    command = [sys.executable, str(RENDER_SCRIPT), "--scene", str(tmp_path / "scene.npz"), "--passes"]
+    command = [*RENDERER, "--scene", str(tmp_path / "scene.npz"), "--passes"]
     command += ["--frames-dir", str(tmp_path), "--threads", "1"]
     child = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert child.returncode == 0, child.stderr[-2000:]

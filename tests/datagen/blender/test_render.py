@@ -19,11 +19,18 @@ SCRIPT = Path(__file__).parents[3] / "blender_scripts" / "render_scene.py"
 
 @pytest.fixture(scope="module")
 def rendered(render, box_scene, tmp_path_factory):
-    """The script itself, as the pipeline calls it."""
+    """The module itself, as the pipeline calls it."""
     frames_dir = tmp_path_factory.mktemp("render") / "frames"
-    done = render(box_scene, frames_dir, command=(str(SCRIPT),))
+    done = render(box_scene, frames_dir, command=("-m", "datagen.blender"))
     assert done.status == 0, done.stderr
     return done, frames_dir
+
+
+def test_the_script_of_a_checkout_is_the_module(rendered, render, box_scene):
+    _, frames_dir = rendered
+    done = render(box_scene, frames_dir, command=(str(SCRIPT),))
+    assert done.status == 0, done.stderr
+    assert (done.events[0]["skipped"], done.events[-1]["rendered"]) == (4, 0)
 
 
 def test_standard_output_is_the_protocol_and_nothing_else(rendered, box_scene):

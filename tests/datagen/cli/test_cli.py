@@ -80,9 +80,7 @@ def test_inspect_and_verify_of_nothing(tmp_path):
 
 @pytest.mark.parametrize("name", ["tiny", "small", "paper"])
 def test_every_configuration_makes_its_plan(name, tmp_path):
-    status, output = run(
-        "plan", "--config", str(ROOT / "configs" / "datagen" / f"{name}.yaml"), "--out", str(tmp_path)
-    )
+    status, output = run("plan", "--config", name, "--out", str(tmp_path))
     assert status == 0, output
     assert (tmp_path / "plan.parquet").exists()
     assert (tmp_path / "dataset.json").exists()

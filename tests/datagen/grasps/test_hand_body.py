@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from datagen.grasps.hand_body import DIGITS, bone_transforms, build_hand_body, local_rotations
+from datagen.grasps.hand_body import bone_transforms, build_hand_body, local_rotations
 from datagen.grasps.synthesis.physics_world import GraspWorld, WristTarget
 from datagen.hands.model import load_open_hand, mirror_hand, pose_hand, shape_hand
+from shards.joints import DIGITS
 
 
 def _random_angles(body, rng, count):

@@ -11,16 +11,24 @@ def _turning(angle_rad: float) -> np.ndarray:
     return T
 
 
-def test_a_resting_object_shows_less_than_half_of_itself():
+def test_a_resting_object_does_not_move():
     movement = measure_movement(_turning(0.0))
     assert movement.rotation_range_rad == pytest.approx(0.0, abs=1e-6)
-    assert movement.view_coverage == pytest.approx((1 - 0.25) / 2, abs=0.02)  # spherical cap
+    assert movement.travel_m == 0.0
 
 
-def test_turning_shows_more_and_is_measured_exactly():
-    coverage = [measure_movement(_turning(a)).view_coverage for a in (0.0, 0.8, 1.6, 3.0)]
-    assert coverage == sorted(coverage)
-    assert measure_movement(_turning(1.3)).rotation_range_rad == pytest.approx(1.3, abs=1e-6)
+@pytest.mark.parametrize("angle_rad", [0.35, 1.3, 3.0])
+def test_the_largest_turn_between_any_two_instants(angle_rad):
+    there_and_back = np.concatenate([_turning(angle_rad), _turning(angle_rad)[::-1]])
+    for T in (_turning(angle_rad), there_and_back):
+        assert measure_movement(T).rotation_range_rad == pytest.approx(angle_rad, abs=0.05 * angle_rad)
+
+
+def test_travel_is_the_length_of_the_path():
+    T = _turning(0.0)
+    T[:25, 0, 3] = np.linspace(0.0, 0.2, 25)
+    T[25:, 0, 3] = np.linspace(0.2, 0.1, 25)
+    assert measure_movement(T).travel_m == pytest.approx(0.3)
 
 
 def test_an_empty_motion_is_an_error():

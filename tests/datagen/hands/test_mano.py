@@ -13,8 +13,6 @@ from scipy import sparse
 from datagen.hands.arm import SLEEVE, ArmStyle, dress_hand
 from datagen.hands.mano import find_mano, load_mano
 from datagen.hands.model import (
-    DIGITS,
-    JOINT_NAMES,
     HandModel,
     load_open_hand,
     mirror_hand,
@@ -23,6 +21,7 @@ from datagen.hands.model import (
 )
 from datagen.input_error import InputError
 from datagen.restricted_pickle import load_restricted_pickle
+from shards.joints import DIGITS, MANO_JOINTS
 from tests.datagen.hands.official_files import (
     left_faces_in_own_order,
     mano_data,
@@ -305,7 +304,7 @@ def test_pickles_of_other_things_are_refused(tmp_path: Path) -> None:
 def test_every_tip_is_on_the_last_bone_of_its_digit(hands: dict[str, HandModel]) -> None:
     for model in hands.values():
         bones = model.weights[model.tip_ids].argmax(axis=1)
-        assert [JOINT_NAMES[bone] for bone in bones] == [f"{digit}3" for digit in DIGITS]
+        assert [MANO_JOINTS[bone] for bone in bones] == [f"{digit}3" for digit in DIGITS]
 
 
 @pytest.mark.slow

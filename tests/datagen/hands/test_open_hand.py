@@ -12,9 +12,10 @@ from jaxtyping import Float
 
 from datagen.hands.builders.anthropometry import SEGMENT_FRACTIONS, segment_deviation
 from datagen.hands.builders.build_open_hand import BASE, build_open_hand, write_hand
-from datagen.hands.builders.hand_arrays import DIGIT_JOINTS, HandArrays, descendants, read_base_hand
+from datagen.hands.builders.hand_arrays import HandArrays, descendants, read_base_hand
 from datagen.hands.builders.relaxed_pose import flexion_axis
 from datagen.hands.model import HandModel, load_open_hand, pose_hand, shape_hand
+from shards.joints import DIGIT_JOINTS
 
 FINGERS = ("index", "middle", "ring", "pinky")
 N_SKIN_VERTS, N_SKIN_FACES = 1609, 3196  # the cap comes after the base hand's own vertices and faces

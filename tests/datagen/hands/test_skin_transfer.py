@@ -9,9 +9,10 @@ import pytest
 import trimesh
 from jaxtyping import Float
 
-from datagen.hands.model import DIGITS, HandModel, load_open_hand, mirror_hand, pose_hand, shape_hand
+from datagen.hands.model import HandModel, load_open_hand, mirror_hand, pose_hand, shape_hand
 from datagen.hands.skin import decode_skin, load_open_skin, open_nail_mask_png
 from datagen.hands.skin_transfer import transferred_corner_uv
+from shards.joints import DIGITS
 from shards.storage.png import decode_png
 from tests.datagen.hands.official_files import texture_lookup, uncapped
 

@@ -5,9 +5,10 @@ from click.testing import CliRunner
 
 from datagen.cli.main import main
 from datagen.config import load_config
-from datagen.inspection.inventory import asset_states
+from datagen.inspection.inventory import AssetState, asset_states
+from datagen.inspection.inventory_table import asset_lines
 from tests.datagen.hands.official_files import write_html, write_mano
-from tests.datagen.licensed_config import ROOT, write_config, write_inputs
+from tests.datagen.licensed_config import write_config, write_inputs
 
 OPEN = ("open hand", "open skins", "starter objects", "HDRIs")
 LICENSED = (
@@ -32,7 +33,7 @@ def states(path):
 
 
 def test_without_licensed_files_the_open_ones_are_there_and_the_others_say_how_to_get_them():
-    found = states(ROOT / "configs" / "datagen" / "tiny.yaml")
+    found = states("tiny")
     assert set(found) == {*OPEN, "Sweet Home 3D models", *LICENSED}
     assert {found[name].state for name in OPEN} == {"present"}
     for name in LICENSED:
@@ -75,9 +76,24 @@ def test_html_without_mano_says_what_it_lacks(tmp_path):
     assert (state.state, "MANO_RIGHT.pkl" in state.problem) == ("wrong", True)
 
 
-def test_the_command_prints_one_table(tmp_path):
-    result = CliRunner().invoke(main, ["assets", "--config", str(ROOT / "configs/datagen/graspxl.yaml")])
+def test_the_command_names_every_input_and_breaks_no_path(tmp_path):
+    arguments = ["assets", "--config", "graspxl"]
+    result = CliRunner().invoke(main, arguments, env={"COLUMNS": "80"})
     assert result.exit_code == 0, result.output
-    for name in LICENSED:
-        assert name in result.output
-    assert "MANO_DIR" in result.output
+    lines = result.output.splitlines()
+    for state in asset_states(load_config("graspxl")):
+        assert any(line.startswith(state.name) and line.endswith(state.state) for line in lines)
+        assert any(line.split()[-1:] == [state.place.split()[-1]] for line in lines), state.place
+        if state.state == "missing":
+            assert state.how_to_get.split()[-1] in result.output
+    assert any("MANO_DIR" in line for line in lines)
+    assert all(len(line) <= 80 or len(line.split()) == 2 for line in lines)  # only a path is longer
+
+
+def test_brackets_are_shown_as_they_are():
+    """`forehoi-open[datagen]` is a package with its extra, not a style."""
+    state = AssetState(
+        name="HDRIs", state="missing", version="", licence="CC0-1.0", place="nowhere yet",
+        setting="sampling.lights.hdris", how_to_get="pip install 'forehoi-open[datagen]' brings them",
+    )  # fmt: skip
+    assert "  to get it  pip install 'forehoi-open[datagen]' brings them\n" in asset_lines([state], 80).plain

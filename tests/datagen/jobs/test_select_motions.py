@@ -312,5 +312,5 @@ def test_the_command_prints_counts_and_writes_reasons(own_inputs):
 @needs_sample
 def test_the_whole_sample_passes_the_published_configuration(tmp_path, monkeypatch):
     monkeypatch.setenv("GRASPXL", str(SAMPLE))
-    selection = select_motions(load_config(ROOT / "configs" / "datagen" / "graspxl.yaml"), tmp_path)
+    selection = select_motions(load_config("graspxl"), tmp_path)
     assert len(selection.kept) == len(selection.decisions) == 87

@@ -17,15 +17,15 @@ from model.data.batch import Batch
 from model.data.index import FRAME_COLUMNS
 from model.data.order import SampleKey
 from model.data.reader import SampleReader
-from model.data.stream import ShardStream, StreamState, check_object_splits, open_motions, validation_config
+from model.data.stream import ShardStream, StreamState, open_motions, validation_config
 from model.errors import ModelError
-from shards.errors import CorruptShardError, ImageError, MissingColumnError
+from shards.errors import CorruptShardError, DatasetNotFoundError, ImageError, MissingColumnError, SplitError
 from shards.reader import open_dataset
-from shards.records import write_record
-from shards.schema import FrameRow
+from shards.schema import FrameRow, ObjectRow
 from shards.splits import SplitRule
 from shards.storage.images import encode_rgb_png
 from shards.storage.parquet import ParquetSource, file_record
+from shards.storage.records import write_record
 from tests.model.data.balls import stream_config, take, uid_of_split, write_balls
 
 
@@ -37,8 +37,9 @@ def balls(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def assert_same(a: Batch, b: Batch, rows: slice = slice(None)) -> None:
     assert a.ids[rows] == b.ids
+    assert a.views[rows] == b.views
     for field in fields(Batch):
-        if field.name not in ("ids", "surface"):
+        if field.name not in ("ids", "views", "surface"):
             left, right = getattr(a, field.name)[rows], getattr(b, field.name)
             torch.testing.assert_close(left, right, rtol=0, atol=0, equal_nan=True, msg=field.name)
 
@@ -55,6 +56,21 @@ def test_batches_have_the_promised_shapes(balls):
         assert batch.occupancy.flatten(1).any(dim=1).all()
         assert (batch.object_amodal | ~batch.object_visible).all()
         assert batch.joints_px.shape == (4, n_views, 21, 2)
+
+
+def test_a_sample_is_named_with_its_clips_and_frames(balls):
+    config = stream_config(balls, views=(2, 2))
+    index = open_motions(config)
+    (batch,) = take(ShardStream(config, index=index), 1)
+    place = {motion.motion_id: number for number, motion in enumerate(index.motions)}
+    for name, sample_id, views in zip(batch.names, batch.ids, batch.views, strict=True):
+        motion_id, epoch, position = sample_id.split(":")
+        key = SampleKey(epoch=int(epoch), position=int(position), item=place[motion_id], n_views=2)
+        sample, _ = SampleReader(index, config).read(key)
+        shown = [f"{clip} frame {frame}" for clip, frame in zip(sample.clip_ids, sample.frame_indices)]
+        assert list(views) == shown
+        assert name == f"{sample_id} ({', '.join(shown)})"
+    assert batch.part(1, 3).names == batch.names[1:3] == batch.to("cpu", torch.bfloat16).names[1:3]
 
 
 def test_moving_a_batch_keeps_geometry_in_float32(balls):
@@ -226,7 +242,7 @@ def assert_one_line(error: BaseException, *parts: str) -> None:
 
 def test_no_finished_shard(tmp_path):
     write_balls(tmp_path, splits=())
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(DatasetNotFoundError) as caught:
         open_motions(stream_config(tmp_path))
     assert_one_line(caught.value, str(tmp_path), "no finished shard")
 
@@ -242,15 +258,20 @@ def test_an_object_in_two_splits_is_refused(balls, tmp_path):
     uid = uid_of_split("train", 0)
     number = int(uid.removeprefix("ball-"))
     other = write_balls(tmp_path, splits=[["val"] * (number + 1)], cameras=1, rule=everything_val)
-    with pytest.raises(ModelError) as caught:
+    with pytest.raises(SplitError) as caught:
         open_motions(stream_config(balls, other))
     assert_one_line(caught.value, f"'{uid}'", "shard-00000", "one split")
-    indices = [
-        open_motions(stream_config(balls)),
-        open_motions(stream_config(other, split="val", views=(1, 2))),
-    ]
-    with pytest.raises(ModelError, match=uid):
-        check_object_splits(indices)
+
+
+def test_an_at_sign_in_a_folder_name_makes_no_variant(tmp_path):
+    """Different objects of a folder `batch@1` may be in different splits."""
+
+    def named(row: ObjectRow) -> ObjectRow:
+        return replace(row, object_uid=f"batch@1/{row.object_uid}")
+
+    index = open_motions(stream_config(write_balls(tmp_path, change_object=named)))
+    assert {motion.object_uid.partition("/")[0] for motion in index.motions} == {"batch@1"}
+    assert len(index.motions) == 3
 
 
 def test_more_views_than_frames(balls):
@@ -264,9 +285,12 @@ def test_a_batch_that_the_ranks_cannot_share(balls):
         ShardStream(stream_config(balls), rank=0, world_size=3)
 
 
-@pytest.mark.parametrize(("name", "value"), [("views", (3, 2)), ("batch_size", 0), ("datasets", ())])
-def test_bad_configuration(name, value):
-    with pytest.raises(ModelError, match=f"data.{name}"):
+@pytest.mark.parametrize(
+    ("section", "name", "value"),
+    [("stream", "views", (3, 2)), ("stream", "batch_size", 0), ("data", "datasets", ())],
+)
+def test_bad_configuration(section, name, value):
+    with pytest.raises(ModelError, match=rf"{section}\.{name}"):
         stream_config("x", **{name: value})
 
 
@@ -307,7 +331,7 @@ def test_a_corrupt_row_is_named(corrupt_row, workers):
 
 
 def test_a_corrupt_row_is_skipped_and_counted_once(corrupt_row):
-    config = stream_config(corrupt_row, on_corrupt="skip", max_corrupt=1)
+    config = stream_config(corrupt_row, max_corrupt=1)
     stream = ShardStream(config)
     batches = take(stream, 12)
     assert len(stream.corrupt_rows) == 1
@@ -316,11 +340,14 @@ def test_a_corrupt_row_is_skipped_and_counted_once(corrupt_row):
     assert [batch.ids for batch in batches] == [batch.ids for batch in take(ShardStream(config), 12)]
 
 
-def test_too_many_corrupt_rows_stop_the_stream(corrupt_row):
-    stream = ShardStream(stream_config(corrupt_row, on_corrupt="skip", max_corrupt=0))
+def test_too_many_corrupt_rows_stop_the_stream(tmp_path):
+    def corrupt_last_frames(frame: FrameRow) -> FrameRow:
+        return replace(frame, rgb=frame.rgb[:-20]) if frame.frame_index == 2 else frame
+
+    root = write_balls(tmp_path, splits=[["train", "train"]], cameras=2, change_frame=corrupt_last_frames)
     with pytest.raises(CorruptShardError) as caught:
-        take(stream, 20)
-    assert_one_line(caught.value, "1 corrupt rows", "at most 0", "frame 2")
+        take(ShardStream(stream_config(root, max_corrupt=1)), 20)
+    assert_one_line(caught.value, "2 corrupt rows", "at most 1", "frame 2")
 
 
 @pytest.mark.parametrize(("column", "workers"), [("rgb", 0), ("rgb", 1), ("joints_px", 0)])
@@ -339,4 +366,4 @@ def test_flipped_bits_in_a_file(tmp_path, column, workers):
     assert_one_line(caught.value, "frames.parquet", "group 0", f"'{column}'")
     # all four frames are needed, and nothing else is left to take their place
     with pytest.raises(CorruptShardError, match="no readable sample"):
-        take(ShardStream(replace(config, on_corrupt="skip", max_corrupt=5)), 1)
+        take(ShardStream(replace(config, max_corrupt=5)), 1)

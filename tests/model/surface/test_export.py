@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from model.surface.color import srgb_from_linear
 from model.surface.export import glb_bytes, voxel_mesh, voxels_ply
 from model.surface.extraction import ExtractionConfig, extract_surface
 from model.surface.mesh import SurfaceMesh
+from shards.color import srgb_from_linear
 from tests.model.surface.shells import ball, shell_fields
 
 

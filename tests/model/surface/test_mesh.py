@@ -3,11 +3,8 @@
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
-from hypothesis import strategies as st
 
 from model.errors import ModelError
-from model.surface.color import linear_from_srgb, srgb_from_linear
 from model.surface.cube_cases import edge_loops, triangle_table
 from model.surface.mesh import SurfaceMesh, check_manifold, face_volumes, vertex_normals
 
@@ -79,13 +76,3 @@ def test_cube_cases() -> None:
         assert crossed == sorted(set(used.tolist()))
         assert crossed == sorted(edge for loop in edge_loops(255 - case) for edge in loop)
         assert len(used) == 3 * sum(len(loop) - 2 for loop in edge_loops(case))
-
-
-@given(st.integers(0, 255))
-def test_srgb_round_trip(value: int) -> None:
-    srgb = np.array([value / 255.0], dtype=np.float32)
-    assert srgb_from_linear(linear_from_srgb(srgb))[0] == pytest.approx(value / 255.0, abs=1e-5)
-
-
-def test_srgb_middle_grey_is_a_fifth_of_the_light() -> None:
-    assert linear_from_srgb(np.array([0.5]))[0] == pytest.approx(0.2140, abs=1e-4)

@@ -20,7 +20,14 @@ from model.errors import ModelError
 from model.training.checkpoint import latest_checkpoint, load_average, read_state
 from model.training.config import TrainerConfig
 from model.training.task import Evaluation
-from model.training.trainer import NonFiniteLossError, StepReport, TrainingStopped, train
+from model.training.trainer import (
+    NonFiniteLossError,
+    RunStarted,
+    StepReport,
+    TrainingEvent,
+    TrainingStopped,
+    train,
+)
 from tests.model.training.toy import OPTIMIZER, ToySource, ToyTask, settings
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -49,6 +56,13 @@ def run(
         **options,
     )
     return task, state, source
+
+
+def run_steps(folder: Path, config: TrainerConfig, **options) -> list[StepReport]:
+    """The reports of a run's steps."""
+    events: list[TrainingEvent] = []
+    run(folder, config, report=events.append, **options)
+    return [event for event in events if isinstance(event, StepReport)]
 
 
 def newest(folder: Path) -> Path:
@@ -84,7 +98,7 @@ def test_k_steps_and_a_resume_equal_a_run_in_one_go_bit_for_bit(tmp_path, steps)
     class StopError(Exception):
         pass
 
-    def stop(report: StepReport) -> None:
+    def stop(report: TrainingEvent) -> None:
         if report.step == first + 1:
             raise StopError
 
@@ -96,6 +110,28 @@ def test_k_steps_and_a_resume_equal_a_run_in_one_go_bit_for_bit(tmp_path, steps)
     assert_same_tensors(tmp_path / "whole", tmp_path / "parts")
 
 
+def test_a_run_says_and_records_its_machine_and_what_is_new_where_it_is_resumed(tmp_path):
+    def notices(steps: int) -> tuple[str, ...]:
+        events: list[TrainingEvent] = []
+        run(tmp_path, settings(steps, precision="auto"), report=events.append)
+        (started,) = (event for event in events if isinstance(event, RunStarted))
+        return started.notices
+
+    (first,) = notices(4)
+    state_file = newest(tmp_path) / "state.json"
+    machine = json.loads(state_file.read_text())["machine"]
+    assert f"precision: {machine['precision']} (" in first
+    assert notices(8) == (f"precision: {machine['precision']}, as before on this kind of machine",)
+
+    state_file = newest(tmp_path) / "state.json"
+    state = json.loads(state_file.read_text())
+    state["machine"]["processor"] = "Another Processor"
+    state_file.write_text(json.dumps(state))
+    _, changed = notices(12)
+    assert changed.startswith("resumed on another kind of machine: processor Another Processor -> ")
+    assert read_state(newest(tmp_path)).machine.processor == machine["processor"]
+
+
 def test_a_finished_run_is_left_alone(tmp_path):
     run(tmp_path, settings(5))
     before = newest(tmp_path).stat().st_mtime_ns
@@ -105,23 +141,16 @@ def test_a_finished_run_is_left_alone(tmp_path):
 
 
 def test_the_loss_falls(tmp_path):
-    losses: list[float] = []
-    run(tmp_path, settings(60), report=lambda report: losses.append(report.losses["loss"]))
+    losses = [report.losses["loss"] for report in run_steps(tmp_path, settings(60))]
     assert sum(losses[-10:]) < 0.2 * sum(losses[:10])
 
 
 def test_two_half_batches_accumulated_equal_one_batch(tmp_path):
     """The noise differs (it belongs to the place in the batch), so only its size is compared."""
-    grads: list[float] = []
-    run(
-        tmp_path / "a",
-        settings(6, accumulate=2),
-        source=ToySource(2),
-        report=lambda r: grads.append(r.gradient_norm),
-    )
-    whole: list[float] = []
-    run(tmp_path / "b", settings(6), source=ToySource(4), report=lambda r: whole.append(r.gradient_norm))
-    assert grads == pytest.approx(whole, rel=0.5)
+    halves = run_steps(tmp_path / "a", settings(6, accumulate=2), source=ToySource(2))
+    whole = run_steps(tmp_path / "b", settings(6), source=ToySource(4))
+    norms = [report.gradient_norm for report in whole]
+    assert [report.gradient_norm for report in halves] == pytest.approx(norms, rel=0.5)
     assert read_state(newest(tmp_path / "a")).samples_consumed == 12
 
 
@@ -166,8 +195,9 @@ def test_sigterm_saves_and_the_next_run_goes_on(tmp_path):
     assert_same_tensors(tmp_path / "whole", tmp_path / "killed")
 
 
-def test_nan_stops_with_the_samples_named_and_the_last_good_state_kept(tmp_path):
-    with pytest.raises(NonFiniteLossError, match=r"the loss is nan .*samples .*toy:2:29.*newest checkpoint"):
+def test_nan_stops_with_motions_clips_and_frames_named_and_the_last_good_state_kept(tmp_path):
+    named = r"toy:2:29 \(clip-29 frame 0, clip-29 frame 7\)"
+    with pytest.raises(NonFiniteLossError, match=rf"the loss is nan .*samples .*{named}.*newest checkpoint"):
         run(tmp_path, settings(20), source=ToySource(4, poison=29))
     state = read_state(newest(tmp_path))
     assert state.step == 4
@@ -189,7 +219,9 @@ class _GradientOverflows(ToyTask):
 
 
 def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_path):
-    with pytest.raises(NonFiniteLossError, match=r"step 5: the gradient is nan .*toy:1:.*newest checkpoint"):
+    with pytest.raises(
+        NonFiniteLossError, match=r"step 5: the gradient is nan .*toy:1:\d+ \(clip-.*newest checkpoint"
+    ):
         train(
             _GradientOverflows(),
             ToySource(4),
@@ -209,7 +241,7 @@ def test_validation_uses_the_averaged_weights_and_takes_them_back(tmp_path):
 
     def validate():
         seen.append({name: p.detach().clone() for name, p in task.module.named_parameters()})
-        return task.evaluate([next(ToySource(2).batches(0, 0)).batch])
+        return task.measure([next(ToySource(2).batches(0, 0)).batch]).evaluation()
 
     train(
         task,
@@ -303,7 +335,7 @@ def test_the_log_is_written_and_what_loads_the_batches_is_closed_however_a_run_e
             finally:
                 closed.append(True)
 
-    def report(made: StepReport) -> None:
+    def report(made: TrainingEvent) -> None:
         if made.step == 5 and end == "sigterm":
             signal.raise_signal(signal.SIGTERM)
 
@@ -327,14 +359,12 @@ def test_a_metric_without_a_number_is_not_logged(tmp_path):
 
 
 def test_waiting_and_speed_are_reported(tmp_path):
-    reports: list[StepReport] = []
-
     class Slow(ToySource):
         def batches(self, epoch, samples_consumed):
             for placed in super().batches(epoch, samples_consumed):
                 time.sleep(0.05)
                 yield placed
 
-    run(tmp_path, settings(4), source=Slow(4), report=reports.append)
+    reports = run_steps(tmp_path, settings(4), source=Slow(4))
     assert all(0.5 < report.waiting_share <= 1.0 for report in reports[1:])
     assert all(0.0 < report.samples_per_s < 90.0 for report in reports)

@@ -17,8 +17,8 @@ from torch import nn
 from model.data.batch import Batch
 from model.training.config import OptimizerConfig, TrainerConfig
 from model.training.step_generators import normal_like
-from model.training.task import Evaluation, Losses
-from model.training.trainer import PlacedBatch, StepReport, train
+from model.training.task import Losses, Measurements
+from model.training.trainer import PlacedBatch, StepReport, TrainingEvent, train
 
 EPOCH = 12  # samples
 OPTIMIZER = OptimizerConfig(
@@ -86,7 +86,13 @@ class ToySource:
             samples_consumed += self.global_batch
             stacked: dict[str, Any] = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
             yield PlacedBatch(
-                batch=Batch(**stacked, ids=tuple(f"toy:{epoch}:{position}" for position in positions)),
+                batch=Batch(
+                    **stacked,
+                    ids=tuple(f"toy:{epoch}:{position}" for position in positions),
+                    views=tuple(
+                        (f"clip-{position} frame 0", f"clip-{position} frame 7") for position in positions
+                    ),
+                ),
                 places=list(places),
                 epoch=epoch,
                 samples_consumed=samples_consumed,
@@ -110,10 +116,10 @@ class ToyTask:
         error = (predicted - batch.images.mean(dim=(1, 3, 4))).square().mean()
         return Losses(total=error, parts={"color": error})
 
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
         errors = [self.loss(batch, [torch.Generator() for _ in batch.ids]).total for batch in batches]
-        return Evaluation(
-            metrics={"error": float(torch.stack(errors).mean())},
+        return Measurements(
+            numbers={"error": [float(error) for error in errors]},
             images={"grey": np.zeros((4, 4, 3), np.uint8)},
         )
 
@@ -123,9 +129,10 @@ def main(folder: str, steps: str, global_batch: str, fault: str = "") -> None:
     source = ToySource(int(global_batch), rank=accelerator.process_index, ranks=accelerator.num_processes)
     task = ToyTask()
 
-    def slow(report: StepReport) -> None:
-        print(report.step, flush=True)
-        time.sleep(0.2 if fault == "slow" else 0.0)
+    def slow(event: TrainingEvent) -> None:
+        if isinstance(event, StepReport):
+            print(event.step, flush=True)
+            time.sleep(0.2 if fault == "slow" else 0.0)
 
     train(
         task,

@@ -13,6 +13,7 @@ from model.sparse_structure.dual_branch import DualBranchFlow
 from model.tensor_files.safetensors_file import shapes_of
 from model.weights.published import find_published, import_networks, published_shapes
 from model.weights.trellis import stage_one_networks
+from tests.model.stages import stage_one
 from tests.model.weights.published import (
     CLASSES,
     DECODER,
@@ -27,7 +28,7 @@ from tests.model.weights.published import (
 
 ROOT = Path(__file__).resolve().parents[3]
 RESEARCH = ROOT.parent / "shared/research/trellis_parameters.json"
-PAPER = load_config(ROOT / "configs/model/paper.yaml")
+PAPER = stage_one(load_config("paper"))
 PREFIXES = {FLOW: "flow.geometry.", ENCODER: "vae.encoder.", DECODER: "vae.decoder."}
 
 
@@ -140,7 +141,7 @@ def _sparse_published_file(path: Path, name: str) -> None:
 def test_the_published_flow_fits_the_paper_config_and_no_other(tmp_path: Path) -> None:
     path = tmp_path / f"{FLOW}_fp16.safetensors"
     _sparse_published_file(path, FLOW)
-    fails(path, tmp_path / "out.safetensors", "import it with configs/model/paper")
+    fails(path, tmp_path / "out.safetensors", "import it with --config paper")
     with pytest.raises(ModelError, match="pos_emb differs by 1"):  # zeros: all 489 keys fit, and are read
         run(path, tmp_path / "out.safetensors", PAPER.stage_one.network, PAPER.vae.network)
     listed = json.loads((tmp_path / "out.keys.json").read_text())[FLOW]

@@ -11,7 +11,6 @@ from torch import nn
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
 from model.networks.lora import LoraSettings, add_lora
-from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne
 from model.sparse_structure.vae import StructureVae
 from model.weights.published import import_networks
@@ -41,7 +40,7 @@ def stage_one(seed: int, flow=SMALL_FLOW) -> StageOne:
         hidden=16,
         channels=flow.masks.feature_channels,
     )
-    return StageOne(FeatureAggregator(sizes), DualBranchFlow(flow))
+    return StageOne(FeatureAggregator(sizes), flow)
 
 
 def copied(module: nn.Module) -> dict[str, torch.Tensor]:

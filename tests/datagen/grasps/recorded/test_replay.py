@@ -4,19 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 from scipy.spatial.transform import Rotation
 
+from datagen.config import read_config
 from datagen.grasps.contact import digit_distances, signed_distances
 from datagen.grasps.object_surface import ObjectSurface
 from datagen.grasps.recorded.graspxl import find_sequences, read_sequence
 from datagen.grasps.recorded.replay import ReplayConfig, ReplayError, replay
 from datagen.grasps.synthesis.synthesise import synthesise_grasp
 from datagen.hands.model import pose_hand, shape_hand
-from datagen.sources.motions import MotionsConfig
 from shards.geometry import invert_transform
-from shards.settings import settings_from_dict
-from tests.datagen.grasps.recorded.graspxl_sample import ROOT
 from tests.datagen.grasps.recorded.official_files import recorded_arrays, write_sequence
 
 UID = "0123456789abcdef0123456789abcdef"
@@ -24,9 +21,7 @@ UID = "0123456789abcdef0123456789abcdef"
 
 @pytest.fixture(scope="module")
 def settings() -> ReplayConfig:
-    text = (ROOT / "configs" / "datagen" / "graspxl.yaml").read_text()
-    motions = settings_from_dict(MotionsConfig, yaml.safe_load(text)["motions"], where="graspxl.yaml")
-    return replace(motions.replay, time_scale=1.0)
+    return replace(read_config("graspxl").motions.replay, time_scale=1.0)
 
 
 @pytest.fixture(scope="module")

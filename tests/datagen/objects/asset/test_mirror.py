@@ -7,6 +7,7 @@ import trimesh
 from datagen.objects.asset.mirror import is_mirrored, mirrored_asset, mirrored_uid, unmirrored_uid
 from datagen.objects.mesh.surface_points import colors_at, face_normals
 from datagen.objects.stores.library import StarterPack
+from shards.splits import object_identity
 
 
 @pytest.fixture(scope="module")
@@ -16,10 +17,18 @@ def rock():
 
 @pytest.mark.parametrize(
     ("uid", "mirrored"),
-    [("a/b", "a/b@mirrored"), ("a/b@large", "a/b@large-mirrored"), ("a/mirrored", "a/mirrored@mirrored")],
+    [
+        ("a/b", "a/b@mirrored"),
+        ("a/b@large", "a/b@large-mirrored"),
+        ("a/mirrored", "a/mirrored@mirrored"),
+        ("batch@1/b", "batch@1/b@mirrored"),
+        ("batch@1/b-mirrored", "batch@1/b-mirrored@mirrored"),
+        ("batch@mirrored/b", "batch@mirrored/b@mirrored"),
+    ],
 )
 def test_uids(uid, mirrored):
     assert mirrored_uid(uid) == mirrored
+    assert object_identity(mirrored) == object_identity(uid)
     assert is_mirrored(mirrored)
     assert not is_mirrored(uid)
     assert unmirrored_uid(mirrored) == uid == unmirrored_uid(uid)

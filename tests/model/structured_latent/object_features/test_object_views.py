@@ -17,7 +17,7 @@ from model.structured_latent.object_features.object_views import (
     object_views,
     sphere_cameras,
 )
-from model.surface.color import linear_from_srgb, srgb_from_linear
+from shards.color import linear_from_srgb, srgb_from_linear
 from shards.errors import DatasetNotFoundError
 from shards.geometry import camera_center, pixel_rays_cam
 from shards.reader import open_dataset

@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from model.surface.color import linear_from_srgb, srgb_from_linear
 from model.surface.export import ROTATION_YUP_FROM_OBJ
+from shards.color import linear_from_srgb, srgb_from_linear
 from shards.schema import ObjectRow
 from tests.model.data.balls import write_balls
 from tests.shards.synthetic import RADIUS_M

@@ -1,0 +1,1 @@
+"""What the commands of `datagen` and `model` share; readers of shards need none of it."""
