@@ -157,7 +157,6 @@ def test_the_mask_is_not_shifted(size):
     standard_error = np.std(shifts, axis=0) / np.sqrt(len(shifts))
     half_a_pixel = 0.5 * abs(np.mean(scales) - 1.0)
     assert len(shifts) >= 20
-    print(size, np.mean(shifts, axis=0), standard_error, half_a_pixel)
     assert np.all(4.0 * standard_error < half_a_pixel), "too few to tell"
     assert np.all(np.abs(np.mean(shifts, axis=0)) < 4.0 * standard_error)
 

@@ -22,11 +22,6 @@ from model.networks.patches import patchify, unpatchify
 from model.networks.transformer import ModulatedCrossBlock
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def test_rms_norm_has_unit_rms_times_gamma() -> None:
     norm = MultiHeadRMSNorm(8, 2)
     torch.nn.init.normal_(norm.gamma)

@@ -22,11 +22,6 @@ from model.networks.sparse.tensor import SparseTensor
 _WINDOWS = [None, Window(size=4, shift=0), Window(size=4, shift=2), Window(size=3, shift=1)]
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def _tensor(fraction: float, channels: int = 12) -> SparseTensor:
     occupancy = torch.rand(2, 8, 8, 8) < fraction
     return SparseTensor.from_dense(torch.randn(2, channels, 8, 8, 8), occupancy)

@@ -24,11 +24,6 @@ from model.networks.transformer import ModulatedCrossBlock, initialise_transform
 _Block = TypeVar("_Block", bound=nn.Module)
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def _tensor(fraction: float, channels: int = 8, resolution: int = 6) -> SparseTensor:
     occupancy = torch.rand(2, *[resolution] * 3) < fraction
     x = SparseTensor.from_dense(torch.randn(2, channels, *[resolution] * 3), occupancy)

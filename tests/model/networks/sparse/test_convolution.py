@@ -18,11 +18,6 @@ from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def _tensor(fraction: float, channels: int = 5, resolution: int = 6) -> SparseTensor:
     occupancy = torch.rand(2, *[resolution] * 3) < fraction
     return SparseTensor.from_dense(torch.randn(2, channels, *[resolution] * 3), occupancy)
