@@ -17,28 +17,36 @@ HTML_DIR  ?=
 export GRASPXL OBJAVERSE MANO_DIR HTML_DIR
 
 VENV    := .venv
+SHARDS  := .venv-shards
 # setuptools warns about every editable installation.
-PIP     := PYTHONWARNINGS=ignore $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+INSTALL := -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+PIP     := PYTHONWARNINGS=ignore $(VENV)/bin/python $(INSTALL)
 RUNTIME := $(VENV)/.runtime-installed
 DEV     := $(VENV)/.dev-installed
 TRAIN   := $(VENV)/.training-installed
+PARITY  := $(VENV)/.parity-installed
 
-.PHONY: help setup render train demo test test-slow check bench clean
+# Two processes share the tests, file by file. Each keeps to one thread: more would wait for each other.
+JOBS    ?= 2
+PYTEST  := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -q
+SPREAD  := --numprocesses $(JOBS) --dist loadfile
+
+.PHONY: help setup render train demo test test-slow test-shards test-parity check bench clean
 
 help: ## list the targets and their variables
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 13
 	@echo
-	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) ARGS=$(ARGS) PYTHON=$(PYTHON)"
+	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) ARGS=$(ARGS) JOBS=$(JOBS) PYTHON=$(PYTHON)"
 	@echo "places of licensed inputs: GRASPXL=$(GRASPXL) OBJAVERSE=$(OBJAVERSE) MANO_DIR=$(MANO_DIR) HTML_DIR=$(HTML_DIR)"
 
 # Blender's module exists for Python 3.11 alone. Debian's python3.11 makes no environments without python3.11-venv.
-$(VENV)/bin/python:
+$(VENV)/bin/python $(SHARDS)/bin/python:
 	@if $(PYTHON) -c 'import ensurepip, sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null; then \
-		echo "creating $(VENV) with $(PYTHON)"; \
-		$(PYTHON) -m venv $(VENV); \
+		echo "creating $(@:/bin/python=) with $(PYTHON)"; \
+		$(PYTHON) -m venv $(@:/bin/python=); \
 	elif test "$(origin PYTHON)" = file && command -v uv >/dev/null; then \
-		echo "creating $(VENV) with uv, which finds or downloads Python 3.11"; \
-		uv venv --quiet --python 3.11 --seed $(VENV); \
+		echo "creating $(@:/bin/python=) with uv, which finds or downloads Python 3.11"; \
+		uv venv --quiet --python 3.11 --seed $(@:/bin/python=); \
 	else \
 		echo "make: $(PYTHON) is no Python 3.11 that can make environments, and Blender's module needs 3.11." \
 			"Install uv, which brings one (pipx install uv), or on Debian 12: apt-get install python3.11-venv," \
@@ -62,6 +70,18 @@ $(TRAIN): $(RUNTIME)
 	@$(PIP) --editable '.[datagen,model]'
 	@touch $@
 
+# mosaicml-streaming asks for transformers < 5 and the clients of five clouds; what is measured here needs none of them.
+$(PARITY): $(DEV)
+	@echo "installing what is compared with"
+	@$(PIP) --editable '.[datagen,model,dev,parity]'
+	@$(PIP) --no-deps mosaicml-streaming
+	@touch $@
+
+$(SHARDS)/.installed: $(SHARDS)/bin/python pyproject.toml requirements.lock
+	@echo "installing shards and its tests"
+	@PYTHONWARNINGS=ignore $< $(INSTALL) --editable '.[shards-dev]'
+	@touch $@
+
 setup: $(RUNTIME) ## create .venv and install the generator
 
 render: $(RUNTIME) ## plan CONFIG into OUT if needed, then render shard SHARD
@@ -79,10 +99,16 @@ demo: $(TRAIN) ## train both stages of tiny unless that is done, then reconstruc
 	$(VENV)/bin/forehoi reconstruct --held-out --out runs/demo --overwrite $(ARGS)
 
 test: $(DEV) ## run the tests, without those marked slow
-	$(VENV)/bin/python -m pytest -q -m "not slow" $(ARGS)
+	$(PYTEST) $(SPREAD) -m "not slow" $(ARGS)
 
-test-slow: $(DEV) ## run the tests that take minutes
-	$(VENV)/bin/python -m pytest -q -m slow $(ARGS)
+test-slow: $(DEV) ## run the tests that take minutes, and property tests with new examples
+	$(PYTEST) -m "slow or hypothesis" --hypothesis-profile explore $(ARGS)
+
+test-shards: $(SHARDS)/.installed ## run the tests of shards alone, without Blender and PyTorch
+	$(SHARDS)/bin/python -m pytest -q -m "not slow" tests/shards $(ARGS)
+
+test-parity: $(PARITY) ## run the comparisons with public packages
+	$(PYTEST) -m parity $(ARGS)
 
 check: $(DEV) ## lint, types, import contracts, then the tests
 	$(VENV)/bin/ruff check .
@@ -91,9 +117,9 @@ check: $(DEV) ## lint, types, import contracts, then the tests
 	$(VENV)/bin/mypy
 	@$(MAKE) --no-print-directory test
 
-bench: $(DEV) ## measure the performance claims of README.md on this machine
+bench: $(PARITY) ## measure the performance claims of README.md on this machine
 	$(VENV)/bin/python -m pytest -q -s tests/benchmarks --override-ini "python_files=bench_*.py" --override-ini addopts=--import-mode=importlib $(ARGS)
 
 clean: ## remove .venv and caches; rendered data stays
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks *.egg-info
+	rm -rf $(VENV) $(SHARDS) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

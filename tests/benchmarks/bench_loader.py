@@ -2,12 +2,8 @@
 
 webdataset and mosaicml-streaming hold exactly the samples of our epoch 0 (the encoded bytes of the
 views that were drawn, nothing else), and decode, crop and stack them with the same functions. Neither is
-a dependency:
-
-    pip install --no-deps webdataset mosaicml-streaming braceexpand xxhash zstd Brotli python-snappy cramjam catalogue
-
-mosaicml-streaming also imports torchvision, for data sets of its own that are not used here; an empty
-package stands in for it when it is missing.
+a dependency; `make bench` installs them (extra "parity"). mosaicml-streaming also imports torchvision, for
+data sets of its own that are not used here; an empty package stands in for it when it is missing.
 """
 
 import importlib.util
@@ -252,7 +248,8 @@ def test_stream_against_pure_decoding(config, say):
 
 
 def test_stream_against_webdataset(config, say, tmp_path):
-    webdataset = pytest.importorskip("webdataset")
+    import webdataset
+
     parts = [str(tmp_path / f"part-{part}.tar") for part in range(WORKERS)]  # it divides by file
     writers = [webdataset.TarWriter(part) for part in parts]
     for i, stored in enumerate(stored_samples(config)):
@@ -279,7 +276,8 @@ def test_stream_against_mosaicml_streaming(config, say, tmp_path, monkeypatch):
     if importlib.util.find_spec("torchvision") is None:
         stand_in_for_torchvision(tmp_path / "stand_in")
         monkeypatch.syspath_prepend(str(tmp_path / "stand_in"))
-    streaming = pytest.importorskip("streaming")
+    import streaming
+
     samples = [as_fields(stored) for stored in stored_samples(config)]
     columns = dict.fromkeys(samples[0], "bytes")
     with streaming.MDSWriter(out=str(tmp_path / "mds"), columns=columns, compression=None) as writer:

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
 from datagen.geometry.raycast import TriangleCaster
@@ -163,7 +164,6 @@ def cameras_config(**changes) -> CamerasConfig:
 
 def ball_behind_a_plate(n_frames: int = 8):
     """An object ball beside a hand that is a plate: from its far side the ball is hidden."""
-    trimesh = pytest.importorskip("trimesh")
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.04)
     plate = trimesh.creation.box((0.005, 0.18, 0.18))
     ball_verts, plate_verts = np.array(ball.vertices), np.array(plate.vertices) + np.array([0.06, 0.0, 0.0])

@@ -26,8 +26,9 @@ def encoder() -> EfficientNetEncoder:
 
 def photograph(name: str) -> torch.Tensor:
     """The central square of a photograph of scikit-image at 224 px."""
-    skimage = pytest.importorskip("skimage")
-    io = pytest.importorskip("skimage.io")
+    import skimage
+    from skimage import io
+
     image = io.imread(Path(skimage.__file__).parent / "data" / name)[..., :3]
     side = min(image.shape[:2])
     top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2
@@ -35,6 +36,7 @@ def photograph(name: str) -> torch.Tensor:
     return resized(torch.from_numpy(square).permute(2, 0, 1)[None].float() / 255, 224)
 
 
+@pytest.mark.parity("skimage")
 @pytest.mark.parametrize("name", IMAGENET)
 def test_the_weights_recognise_photographs(name: str) -> None:
     network = load_efficientnet(EfficientNetConfig(image_size=224, grid=16)).pyramid.network
@@ -46,6 +48,7 @@ def test_the_weights_recognise_photographs(name: str) -> None:
     assert float(ours[sorted(IMAGENET[name])].sum()) > 0.7
 
 
+@pytest.mark.parity("skimage")
 @pytest.mark.parametrize("name", IMAGENET)
 def test_the_tensorflow_normalisation_is_surer_than_that_of_the_packages_readme(name: str) -> None:
     network = load_efficientnet(EfficientNetConfig(image_size=224, grid=16)).pyramid.network

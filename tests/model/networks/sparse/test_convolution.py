@@ -112,10 +112,10 @@ def test_the_pure_path_runs_without_a_gpu() -> None:
     assert not uses_spconv(torch.zeros(1, 1))
 
 
+@pytest.mark.parity("spconv")
 @pytest.mark.parametrize("kernel", [3, 5])
 def test_spconv_gives_the_same_numbers(kernel: int) -> None:
     """Forward only: spconv's gradient needs CUDA even for CPU tensors."""
-    pytest.importorskip("spconv.pytorch")
     layer, x = SparseConv3d(5, 7, kernel), _tensor(0.3)
     state = torch.get_rng_state()
     for _ in range(2):  # the second time with the pairs kept
@@ -124,8 +124,10 @@ def test_spconv_gives_the_same_numbers(kernel: int) -> None:
     assert torch.equal(state, torch.get_rng_state())
 
 
+@pytest.mark.parity("spconv")
 def test_spconv_multiplies_pointwise_as_written_here() -> None:
-    spconv = pytest.importorskip("spconv.pytorch")
+    import spconv.pytorch as spconv
+
     theirs, x = spconv.SubMConv3d(5, 7, 1), _tensor(0.3)
     index = torch.cat([x.grid.batch_index[:, None], x.grid.coordinates], dim=1).int()
     out = theirs(spconv.SparseConvTensor(x.features, index, [6] * 3, 2)).features
@@ -138,7 +140,7 @@ def test_spconv_multiplies_pointwise_as_written_here() -> None:
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_spconv_and_pairs_agree_on_a_gpu() -> None:
-    pytest.importorskip("spconv.pytorch")
+    pytest.importorskip("spconv.pytorch", reason="needs the spconv of this CUDA")
     layer, x = SparseConv3d(16, 32, 3).cuda(), _tensor(0.3, channels=16).to(torch.device("cuda"))
     weight, bias = layer.conv.weight, layer.conv.bias
     results = []
