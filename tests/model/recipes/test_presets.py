@@ -5,11 +5,11 @@ from dataclasses import replace
 from textwrap import dedent
 
 import pytest
-from model.recipes.slat_config import load_any_config
 
 from model.encoders.dino import DinoConfig
 from model.flow import UniformTime
-from model.recipes.config import PRESETS, TrainingConfig, load_config
+from model.recipes.config import PRESETS, load_config
+from model.recipes.stage_one_config import StageOneTrainingConfig
 from shards.configuration.presets import preset_names
 from tests.model.small_run import ROOT, fails, forehoi
 
@@ -32,13 +32,13 @@ encoders:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_what_is_printed_reads_back_as_the_same_configuration(name, tmp_path):
-    config = load_any_config(name)
+    config = load_config(name)
     assert config.name == name
     status, text = forehoi("config", name)
     assert status == 0
     assert "extends" not in text
     (tmp_path / "printed.yaml").write_text(text)
-    assert load_any_config(tmp_path / "printed.yaml") == config
+    assert load_config(tmp_path / "printed.yaml") == config
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -50,10 +50,11 @@ def test_an_ablation_is_five_lines(tmp_path):
     path = tmp_path / "no_masks.yaml"
     path.write_text(ABLATION)
     tiny = load_config("tiny")
-    part, recipe = tiny.stage_one, tiny.stage_one.recipe
+    assert isinstance(tiny, StageOneTrainingConfig)
+    section, recipe = tiny.stage_one, tiny.stage_one.recipe
     recipe = replace(recipe, trainer=replace(recipe.trainer, seed=1))
     assert load_config(path) == replace(
-        tiny, name="no_masks", stage_one=replace(part, beta=0.0, recipe=recipe)
+        tiny, name="no_masks", stage_one=replace(section, beta=0.0, recipe=recipe)
     )
     status, text = forehoi("config", path, "--diff", "tiny")
     assert status == 0
@@ -68,7 +69,7 @@ def test_a_section_of_another_kind_is_replaced(tmp_path):
     path = tmp_path / "dino.yaml"
     path.write_text(OTHER_KIND)
     config = load_config(path)
-    assert isinstance(config, TrainingConfig)
+    assert isinstance(config, StageOneTrainingConfig)
     assert isinstance(config.encoders.image, DinoConfig)
     path.write_text(OTHER_KIND.replace("!replace ", ""))
     line = fails("config", path)
