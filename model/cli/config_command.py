@@ -4,8 +4,8 @@ import click
 import yaml
 
 from model.cli.options import plain_errors
-from model.recipes.config import as_yaml
-from model.recipes.slat_config import load_any_config
+from model.recipes.components.component_identity import as_yaml
+from model.recipes.config import load_config
 from shards.configuration.differences import differences
 
 __all__ = ["config_command"]
@@ -25,9 +25,9 @@ def config_command(name: str, other: str | None) -> None:
       forehoi config small
       forehoi config own.yaml --diff tiny
     """
-    text = as_yaml(load_any_config(name))
+    text = as_yaml(load_config(name))
     if other is None:
         click.echo(text, nl=False)
         return
-    for line in differences(yaml.safe_load(as_yaml(load_any_config(other))), yaml.safe_load(text)):
+    for line in differences(yaml.safe_load(as_yaml(load_config(other))), yaml.safe_load(text)):
         click.echo(line)

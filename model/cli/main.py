@@ -1,6 +1,5 @@
 """The `forehoi` command: parse, call, print. Everything else lives in the modules it calls."""
 
-from collections.abc import Callable
 from pathlib import Path
 
 import click
@@ -14,12 +13,10 @@ from model.cli.options import plain_errors
 from model.cli.reconstruct import reconstruct_command
 from model.cli.weights import weights
 from model.errors import ModelError
-from model.recipes.components import PARTS, train_part, trained_parts
-from model.recipes.config import TrainingConfig
-from model.recipes.slat_components import SLAT_PARTS, train_slat_part, trained_slat_parts
-from model.recipes.slat_config import SlatTrainingConfig, load_any_config
+from model.recipes.components.component import Component
+from model.recipes.config import COMPONENT_NAMES, TrainingConfig, load_config
+from model.recipes.train_component import train_component
 from model.training.progress import TrainingProgress
-from model.training.trainer import TrainingEvent
 
 __all__ = ["main"]
 
@@ -50,7 +47,7 @@ main.add_command(reconstruct_command)
     metavar="NAME|FILE",
     default=DEFAULT_CONFIG,
     show_default=True,
-    help="Preset or YAML file, when WHAT names a part.",
+    help="Preset or YAML file, when WHAT names a component.",
 )
 @click.option(
     "--out",
@@ -60,9 +57,9 @@ main.add_command(reconstruct_command)
 )
 @plain_errors
 def train(what: str, config_name: str, out: Path | None) -> None:
-    """Train WHAT: a preset or a YAML file (all parts that it trains), or one part of it.
+    """Train WHAT: a preset or a YAML file (all components that it trains), or one component of it.
 
-    Parts of stage 1: vae, hand_encoder, stage_one; of stage 2: slat_vae, slat_flow.
+    Components of stage 1: vae, hand_encoder, stage_one; of stage 2: slat_vae, slat_flow.
 
     Continues where it was stopped. Over several processes: torchrun --nproc-per-node N -m model train ...
 
@@ -71,51 +68,41 @@ def train(what: str, config_name: str, out: Path | None) -> None:
       forehoi train tiny
       forehoi train hand_encoder --config hands
     """
-    one_part = what in (*PARTS, *SLAT_PARTS)
-    name_or_file = config_name if one_part else what
-    config = load_any_config(name_or_file)
-    names = trained_slat_parts(config) if isinstance(config, SlatTrainingConfig) else trained_parts(config)
-    if one_part:
-        names = (_part_of(config, what, name_or_file),)
+    is_component = what in COMPONENT_NAMES
+    name_or_file = config_name if is_component else what
+    config = load_config(name_or_file)
+    components = (_component(config, what, name_or_file),) if is_component else _to_train(config)
     folder = out or Path("runs") / Path(name_or_file).stem
     accelerator = Accelerator()
     metrics = {}
-    for name in names:
-        with TrainingProgress(name, enabled=accelerator.is_main_process) as bar:
-            metrics[name] = _train(name, config, folder, accelerator, bar.update)
+    for component in components:
+        with TrainingProgress(component.name, enabled=accelerator.is_main_process) as bar:
+            metrics[component.name] = train_component(
+                component, config, folder, accelerator=accelerator, report=bar.update
+            )
     if accelerator.is_main_process:
         Console().print(_table(config, metrics, folder))
 
 
-def _part_of(config: TrainingConfig | SlatTrainingConfig, name: str, source: str) -> str:
-    """The name, if it is a part of this configuration's stage."""
-    parts = SLAT_PARTS if isinstance(config, SlatTrainingConfig) else PARTS
-    if name not in parts:
+def _to_train(config: TrainingConfig) -> tuple[Component, ...]:
+    return tuple(component for component in config.components() if component.recipe is not None)
+
+
+def _component(config: TrainingConfig, name: str, source: str) -> Component:
+    """The one of this name, if the configuration has it."""
+    components = {component.name: component for component in config.components()}
+    if name not in components:
         raise ModelError(
             source,
-            f"has no {name}",
-            expected=f"a part: {', '.join(parts)}",
+            f"has no {name} to train",
+            expected=f"a component: {', '.join(components)}",
             action="Give the other --config.",
         )
-    return name
+    return components[name]
 
 
-def _train(
-    name: str,
-    config: TrainingConfig | SlatTrainingConfig,
-    folder: Path,
-    accelerator: Accelerator,
-    report: Callable[[TrainingEvent], None],
-) -> dict[str, float]:
-    if isinstance(config, SlatTrainingConfig):
-        return train_slat_part(name, config, folder, accelerator=accelerator, report=report)
-    return train_part(name, config, folder, accelerator=accelerator, report=report)
-
-
-def _table(
-    config: TrainingConfig | SlatTrainingConfig, metrics: dict[str, dict[str, float]], folder: Path
-) -> Table:
-    """Metrics of every part, and what they were measured on."""
+def _table(config: TrainingConfig, metrics: dict[str, dict[str, float]], folder: Path) -> Table:
+    """Metrics of every component, and what they were measured on."""
     same = config.validation.split == config.data.split
     where = (
         "held-out cameras of the training motions"

@@ -18,19 +18,19 @@ MEAN_LATENT = "mean_latent_"  # of any metric of stage 2
 
 
 def metrics_table(title: str, metrics: dict[str, dict[str, float]], caption: str) -> Table:
-    """A row for each metric of each part, and another for each further thing that it has to beat."""
+    """A row for each metric of each component, and another for each further thing that it has to beat."""
     table = Table(title=title, title_justify="left", caption=caption, caption_justify="left")
-    for column in ("part", "metric", "value", "to beat", ""):
+    for column in ("component", "metric", "value", "to beat", ""):
         table.add_column(column, justify="right" if column in ("value", "to beat") else "left")
     baselines = {name for to_beat in TO_BEAT.values() for name in to_beat}
-    for part, values in metrics.items():
+    for component, values in metrics.items():
         for name, value in values.items():
             if name in baselines or name.startswith(MEAN_LATENT):
                 continue
             to_beat = TO_BEAT.get(name, {f"{MEAN_LATENT}{name}": "mean latent"})
             known = [(values[baseline], label) for baseline, label in to_beat.items() if baseline in values]
             measured = [(f"{number:.3f}", label) for number, label in known if not math.isnan(number)]
-            table.add_row(part, name, f"{value:.3f}", *(measured[0] if measured else ("", "")))
+            table.add_row(component, name, f"{value:.3f}", *(measured[0] if measured else ("", "")))
             for number, label in measured[1:]:
                 table.add_row("", "", "", number, label)
     return table

@@ -7,12 +7,9 @@ from rich.console import Console
 from rich.table import Table
 
 from model.cli.options import plain_errors
+from model.recipes.config import load_config
 from model.recipes.merging import export_run_adapter, merge_run
-from model.recipes.slat_config import SlatTrainingConfig, load_any_config
 from model.weights.published import ImportReport, import_networks
-from model.weights.slat import slat_networks
-from model.weights.trellis import stage_one_networks
-from model.weights.weight_file import StartConfig
 
 __all__ = ["weights"]
 
@@ -57,12 +54,7 @@ def import_weights(source: Path, config_name: str, out: Path) -> None:
       forehoi weights import TRELLIS-image-large --config paper --out weights/trellis.safetensors
       forehoi weights import TRELLIS-image-large --config paper_slat --out weights/slat.safetensors
     """
-    config = load_any_config(config_name)
-    if isinstance(config, SlatTrainingConfig):
-        networks = slat_networks(config.slat_flow.network, config.slat_vae.network)
-    else:
-        networks = stage_one_networks(config.stage_one.network, config.vae.network)
-    report = import_networks(source, networks, out)
+    report = import_networks(source, load_config(config_name).published_networks(), out)
     console = Console()
     console.print(_table(report))
     for path in report.ignored:
@@ -91,10 +83,7 @@ def merge(run: Path, out: Path) -> None:
     start = merge_run(run, out)
     console = Console()
     console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
-    named = str(start)
-    if isinstance(start, StartConfig):
-        named = f"{{weights: {start.weights}, latent_scale: {start.latent_scale}}}"
-    console.print(f"to start from it: start: {named}", soft_wrap=True)
+    console.print(f"to start from it: start: {start}", soft_wrap=True)
 
 
 @weights.command("export-adapter")

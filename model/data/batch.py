@@ -45,7 +45,6 @@ class TrainingSample:
 
     motion_id: str
     object_uid: str
-    split: str
     clip_ids: tuple[str, ...]  # one per view
     frame_indices: Int[np.ndarray, " view"]
     images: Float32[np.ndarray, "view 3 size size"]  # sRGB, 0..1; 0 outside the rendered image
@@ -113,7 +112,17 @@ class Batch:
     joints_px: Float[torch.Tensor, "batch view 21 2"]  # NaN behind the camera
     is_right: Bool[torch.Tensor, " batch"]
     ids: tuple[str, ...]  # "motion_id:epoch:position", one per sample
+    views: tuple[
+        tuple[str, ...], ...
+    ] = ()  # "clip_id frame N" of each view of each sample; empty: not of a shard
     surface: SurfaceBatch | None = None  # read only where StreamConfig.surface asks for it
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What each sample is and what it shows, for a person who looks for it."""
+        if not self.views:
+            return self.ids
+        return tuple(f"{name} ({', '.join(views)})" for name, views in zip(self.ids, self.views, strict=True))
 
     @property
     def true_surface(self) -> SurfaceBatch:
@@ -147,7 +156,7 @@ class Batch:
         return replace(self, **moved, surface=surface)
 
 
-_NOT_STACKED = ("ids", "surface")
+_NOT_STACKED = ("ids", "views", "surface")
 
 
 def stack_samples(samples: Sequence[TrainingSample], ids: Sequence[str], *, shared: bool = False) -> Batch:
@@ -169,6 +178,10 @@ def stack_samples(samples: Sequence[TrainingSample], ids: Sequence[str], *, shar
     return Batch(
         **{f.name: stacked(f.name) for f in fields(Batch) if f.name not in _NOT_STACKED},
         ids=tuple(ids),
+        views=tuple(
+            tuple(f"{clip} frame {frame}" for clip, frame in zip(sample.clip_ids, sample.frame_indices))
+            for sample in samples
+        ),
         surface=join_surfaces(surfaces, [s.object_uid for s in samples], shared=shared) if surfaces else None,
     )
 

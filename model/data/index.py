@@ -148,5 +148,5 @@ def _check_enough(
                 places,
                 f"{motion.motion_id} has {motion.n_frames} frames with cameras '{config.cameras}'",
                 expected=f"at least the {config.views[1]} views asked for",
-                action="Lower data.views.",
+                action="Lower `views` in the recipe, or in `validation`.",
             )

@@ -88,7 +88,7 @@ class SampleReader:
     def read(self, key: SampleKey) -> tuple[TrainingSample, tuple[str, ...]]:
         """The sample, and one line for each corrupt row met on the way.
 
-        A corrupt row raises its ShardError when `on_corrupt` is "raise". Otherwise other views of the
+        A corrupt row raises its ShardError where `max_corrupt` is 0. Otherwise other views of the
         motion, then other motions take its place: a function of (seed, epoch, position) and the data.
         """
         motion = self._index.motions[key.item]
@@ -104,7 +104,7 @@ class SampleReader:
                 views = choose_views(motion, key.n_views, views_rng)
                 return self._sample(motion, views, crop_rng), tuple(faults)
             except _CORRUPT as error:
-                if self._config.on_corrupt == "raise":
+                if self._config.max_corrupt == 0:
                     raise
                 faults.append(str(error))
         raise CorruptShardError(
@@ -123,7 +123,6 @@ class SampleReader:
         sample = TrainingSample(
             motion_id=motion.motion_id,
             object_uid=motion.object_uid,
-            split=motion.split,
             clip_ids=tuple(clips["clip_id"][row] for row, _ in chosen),
             frame_indices=np.array([frame for _, frame in chosen]),
             images=_planes([view.image for view in views]),

@@ -64,7 +64,7 @@ class ShardStream:
             )
         if config.endless and config.batch_size % world_size:
             raise ModelError(
-                "data.batch_size",
+                "recipe.batch_size",
                 f"{config.batch_size} samples cannot be shared by {world_size} ranks",
                 expected="a multiple of the number of ranks",
                 action="batch_size counts the samples of all ranks together.",

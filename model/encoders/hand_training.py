@@ -12,10 +12,17 @@ from torch.nn import functional
 from model.data.batch import Batch
 from model.encoders.hand import HandNet, HandOutput
 from model.evaluation.overlap import intersection_over_union
-from model.training.task import Evaluation, Losses
+from model.training.task import Losses, Measurements
 
-__all__ = ["HandLossConfig", "HandTask", "hand_losses", "joint_positions"]
+__all__ = ["METRICS", "HandLossConfig", "HandTask", "hand_losses", "joint_positions"]
 
+METRICS = (
+    "hand_mask_iou",  # of hand and arm, at stride 4
+    "held_object_iou",  # of its visible part, at stride 4
+    "hand_side_accuracy",  # right told from left
+    "hand_pck5",  # share of the joints inside the image that are found within 5 % of its side
+    "hand_joint_error",  # of the same joints, % of the side
+)
 _PCK_SIDE = 0.05  # of the image's side
 _IMAGES = 8
 
@@ -101,21 +108,17 @@ class HandTask:
         return Losses(total=total, parts=means)
 
     @torch.no_grad()
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Metrics over all views, and images of the first.
-
-        hand_mask_iou: hand and arm at stride 4, mean over views; held_object_iou: the same of the visible object.
-        hand_pck5: share of the joints in the image that are found within 5 % of its side; hand_joint_error:
-        their mean error in % of the side. hand_side_accuracy: right told from left.
-        """
-        sums = _Sums()
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
+        """METRICS of every view, or of every joint inside its image; images of the first batch."""
+        numbers: dict[str, list[float]] = {name: [] for name in METRICS}
         images: dict[str, UInt8[np.ndarray, "height width 3"]] = {}
         for batch in batches:
             output = self.module(batch.images.flatten(0, 1))
-            sums.add(output, batch)
+            for name, values in _scores(output, batch).items():
+                numbers[name] += values.tolist()
             if not images:
                 images = {"hand": _montage(output, batch)}
-        return Evaluation(metrics=sums.metrics(), images=images)
+        return Measurements(numbers=numbers, images=images)
 
 
 def _recolored(
@@ -128,37 +131,21 @@ def _recolored(
     return (gain * images.clamp_min(1e-4) ** power).clamp(0, 1)
 
 
-class _Sums:
-    """Metrics over all views of all batches."""
-
-    def __init__(self) -> None:
-        self._values: dict[str, list[Tensor]] = {
-            "hand_mask_iou": [],
-            "held_object_iou": [],
-            "distance": [],
-            "hand_side_accuracy": [],
-        }
-
-    def add(self, output: HandOutput, batch: Batch) -> None:
-        for name, logits, mask in (
-            ("hand_mask_iou", output.mask_logits, batch.hand_visible),
-            ("held_object_iou", output.object_logits, batch.object_visible),
-        ):
-            truth = _covered(mask, logits.shape[-1]) > 0.5
-            self._values[name].append(intersection_over_union(logits > 0, truth))
-        position, inside = _true_joints(batch)
-        distance = (joint_positions(output.joint_logits) - position).norm(dim=-1)
-        self._values["distance"].append(distance[inside])
-        right = (output.right_logit > 0) == (_side(batch) > 0.5)
-        self._values["hand_side_accuracy"].append(right)
-
-    def metrics(self) -> dict[str, float]:
-        """NaN for what had nothing to be measured on."""
-        values = {name: torch.cat(parts).float().cpu() for name, parts in self._values.items() if parts}
-        distance = values.pop("distance", torch.empty(0))
-        values["hand_pck5"] = (distance < _PCK_SIDE).float()
-        values["hand_joint_error"] = 100 * distance
-        return {name: float(value.mean()) for name, value in values.items()}
+def _scores(output: HandOutput, batch: Batch) -> dict[str, Float[Tensor, " _"]]:
+    """METRICS of every view, the last two of every joint that is inside."""
+    iou = {}
+    for name, logits, mask in (
+        ("hand_mask_iou", output.mask_logits, batch.hand_visible),
+        ("held_object_iou", output.object_logits, batch.object_visible),
+    ):
+        iou[name] = intersection_over_union(logits > 0, _covered(mask, logits.shape[-1]) > 0.5)
+    position, inside = _true_joints(batch)
+    distance = (joint_positions(output.joint_logits) - position).norm(dim=-1)[inside]
+    return iou | {
+        "hand_side_accuracy": ((output.right_logit > 0) == (_side(batch) > 0.5)).float(),
+        "hand_pck5": (distance < _PCK_SIDE).float(),
+        "hand_joint_error": 100 * distance,
+    }
 
 
 def _covered(mask: Bool[Tensor, "batch view size size"], cells: int) -> Float[Tensor, "flat cell cell"]:

@@ -6,19 +6,21 @@ Opening a run tells what is missing, and reads its weights once for their digest
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, TypeVar
 
 import torch
 
 from model.encoders.hand import HandNet, packaged_hand_net
 from model.errors import ModelError
-from model.recipes.components import load_stage_one, trained_parts
-from model.recipes.config import PRESETS, TrainingConfig
-from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, trained_slat_parts
-from model.recipes.slat_config import SlatTrainingConfig, parse_any_config
+from model.recipes.components.recipe import Recipe
+from model.recipes.components.slat_flow_component import SlatFlowComponent
+from model.recipes.components.stage_one_component import StageOneComponent
+from model.recipes.config import PRESETS, TrainingConfig, parse_config
+from model.recipes.stage_one_config import StageOneTrainingConfig
+from model.recipes.stage_two_config import StageTwoTrainingConfig
 from model.sparse_structure.stage_one import StageOneTask
 from model.structured_latent.flow_training import SlatFlowTask
 from model.training.checkpoint import latest_checkpoint, read_state
-from model.training.config import TrainerConfig
 from shards.configuration.presets import preset_names
 
 __all__ = [
@@ -33,6 +35,7 @@ __all__ = [
     "open_stage_two",
 ]
 
+_Config = TypeVar("_Config", StageOneTrainingConfig, StageTwoTrainingConfig)
 _AVERAGE = "average.safetensors"  # what inference uses of a checkpoint
 
 
@@ -40,7 +43,7 @@ _AVERAGE = "average.safetensors"  # what inference uses of a checkpoint
 class Checkpoint:
     """Weights that decide a result."""
 
-    part: str
+    component: str
     path: Path
     step: int
     steps: int  # of the whole training
@@ -53,7 +56,7 @@ class StageOneRun:
     """A training of stage 1 that can be loaded."""
 
     folder: Path
-    config: TrainingConfig
+    config: StageOneTrainingConfig
     checkpoints: tuple[Checkpoint, ...]
 
 
@@ -62,7 +65,7 @@ class StageTwoRun:
     """A training of stage 2 that can be loaded."""
 
     folder: Path
-    config: SlatTrainingConfig
+    config: StageTwoTrainingConfig
     checkpoints: tuple[Checkpoint, ...]
 
 
@@ -96,37 +99,19 @@ class Networks:
 
 def open_stage_one(run: Path) -> StageOneRun:
     """ModelError, naming the command that trains it, when the folder holds no trained stage 1."""
-    config = _config(run, "stage_one")
-    assert isinstance(config, TrainingConfig)  # what trains the part of this name
-    recipes = {"vae": config.vae, "hand_encoder": config.hand_encoder, "stage_one": config.stage_one}
-    return StageOneRun(
-        folder=run,
-        config=config,
-        checkpoints=tuple(
-            _checkpoint(run, part, recipes[part].recipe.trainer)  # type: ignore[union-attr]
-            for part in trained_parts(config)
-        ),
-    )
+    config = _config(run, StageOneComponent.name, StageOneTrainingConfig, stage=1)
+    return StageOneRun(folder=run, config=config, checkpoints=_checkpoints(run, config, stage=1))
 
 
 def open_stage_two(run: Path) -> StageTwoRun:
     """ModelError, naming the command that trains it, when the folder holds no trained stage 2."""
-    config = _config(run, "slat_flow")
-    assert isinstance(config, SlatTrainingConfig)
-    recipes = {"slat_vae": config.slat_vae, "slat_flow": config.slat_flow}
-    return StageTwoRun(
-        folder=run,
-        config=config,
-        checkpoints=tuple(
-            _checkpoint(run, part, recipes[part].recipe.trainer)  # type: ignore[union-attr]
-            for part in trained_slat_parts(config)
-        ),
-    )
+    config = _config(run, SlatFlowComponent.name, StageTwoTrainingConfig, stage=2)
+    return StageTwoRun(folder=run, config=config, checkpoints=_checkpoints(run, config, stage=2))
 
 
 def load_networks(one: StageOneRun, two: StageTwoRun | None, device: torch.device) -> Networks:
     """Averaged weights, ready for inference. ModelError, ShardError."""
-    task = load_stage_one(one.config, one.folder, device)
+    task = one.config.flow.load(one.folder, device)
     stage_one = StageOneNetworks(
         task=task,
         # Where stage 1 looks through another kind of hand encoder, the packaged one finds the hand.
@@ -137,44 +122,58 @@ def load_networks(one: StageOneRun, two: StageTwoRun | None, device: torch.devic
     stage_two = None
     if two is not None:
         stage_two = StageTwoNetworks(
-            task=load_slat_flow(two.config, two.folder, device),
+            task=two.config.flow.load(two.folder, device),
             image_size=two.config.slat_flow.recipe.image_size,
         )
     checkpoints = (*one.checkpoints, *(two.checkpoints if two is not None else ()))
     return Networks(stage_one=stage_one, stage_two=stage_two, device=device, checkpoints=checkpoints)
 
 
-def _config(run: Path, part: str) -> TrainingConfig | SlatTrainingConfig:
-    """The configuration that the newest checkpoint of a part was trained with."""
-    path = _newest(run, part)
-    return parse_any_config(read_state(path).config_yaml, where=f"{path}/state.json")
+def _config(run: Path, name: str, kind: type[_Config], *, stage: Literal[1, 2]) -> _Config:
+    """The configuration that the newest checkpoint of a component was trained with."""
+    path = _newest(run, name, stage)
+    config = parse_config(read_state(path).config_yaml, where=f"{path}/state.json")
+    if not isinstance(config, kind):
+        raise ModelError(
+            path,
+            "was trained with a configuration of the other stage",
+            expected=f"a training of stage {stage}",
+            action="Check the path.",
+        )
+    return config
 
 
-def _checkpoint(run: Path, part: str, trainer: TrainerConfig) -> Checkpoint:
-    path = _newest(run, part)
+def _checkpoints(run: Path, config: TrainingConfig, *, stage: Literal[1, 2]) -> tuple[Checkpoint, ...]:
+    """Of all components that the configuration trains."""
+    trained = ((component.name, component.recipe) for component in config.components())
+    return tuple(
+        _checkpoint(_newest(run, name, stage), name, recipe) for name, recipe in trained if recipe is not None
+    )
+
+
+def _checkpoint(path: Path, name: str, recipe: Recipe) -> Checkpoint:
     state = read_state(path)
     with (path / _AVERAGE).open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     return Checkpoint(
-        part=part,
+        component=name,
         path=path,
         step=state.step,
-        steps=trainer.steps,
+        steps=recipe.trainer.steps,
         config_sha256=state.config_sha256,
         weights_sha256=digest,
     )
 
 
-def _newest(run: Path, part: str) -> Path:
-    path = latest_checkpoint(run / part / "checkpoints")
+def _newest(run: Path, name: str, stage: Literal[1, 2]) -> Path:
+    path = latest_checkpoint(run / name / "checkpoints")
     if path is None:
-        is_second = part in SLAT_PARTS
+        otherwise = {1: ".", 2: "; or stop after the voxels: --stages one."}
         raise ModelError(
-            run / part,
+            run / name,
             "holds no checkpoint",
-            expected=f"a trained stage {2 if is_second else 1}",
-            action=f"Train it first: forehoi train {_config_of(run)} --out {run}"
-            + ("; or stop after the voxels: --stages one." if is_second else "."),
+            expected=f"a trained stage {stage}",
+            action=f"Train it first: forehoi train {_config_of(run)} --out {run}{otherwise[stage]}",
         )
     return path
 

@@ -166,7 +166,7 @@ def _notes(
 ) -> tuple[str, ...]:
     """About the input, the weights and the result."""
     partly = [c for c in networks.checkpoints if c.step < c.steps]
-    notes = [*frames.notes, *(f"{c.part} is trained for {c.step} of {c.steps} steps" for c in partly)]
+    notes = [*frames.notes, *(f"{c.component} is trained for {c.step} of {c.steps} steps" for c in partly)]
     empty = [frame.name for frame, mask in zip(frames.frames, masks) if not (mask > 0.5).any()]
     if empty:
         notes.append(f"no object seen in {', '.join(empty)}: empty mask")

@@ -42,7 +42,7 @@ class LoraSettings:
 
     rank: int
     alpha: int
-    dropout: float
+    dropout: float = 0.0
 
     def __post_init__(self) -> None:
         if self.rank < 1 or self.alpha <= 0 or not 0 <= self.dropout < 1:

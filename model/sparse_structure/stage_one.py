@@ -1,6 +1,5 @@
 """Stage 1 as one module and its training: amodal masks and shape denoised together (paper, 3.1-3.3)."""
 
-import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -32,8 +31,8 @@ from model.networks.transformer import layer_norm
 from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow, DualCondition
 from model.sparse_structure.stage_one_images import prediction_rows
 from model.sparse_structure.vae import StructureVae, occupancy_from_logits
-from model.training.step_generators import normal_like, uniform
-from model.training.task import Evaluation, Losses, Measurements
+from model.training.step_generators import batch_generator, normal_like, uniform
+from model.training.task import Losses, Measurements
 
 METRICS = (
     "voxel_iou",
@@ -170,29 +169,19 @@ class StageOneTask:
         logits = self.vae.decoder(clean["geometry"] * self.config.latent_scale)
         return Prediction(occupancy=occupancy_from_logits(logits), masks=clean["masks"][:, :, 0])
 
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Means of METRICS over samples or views; a metric without views is NaN."""
-        return self.measure(batches).evaluation()
-
     @torch.no_grad()
     def measure(self, batches: Iterable[Batch]) -> Measurements:
         """METRICS of every sample or view, with noise that belongs to the batch."""
         numbers: dict[str, list[float]] = {name: [] for name in METRICS}
         images: dict[str, np.ndarray] = {}
         for batch in batches:
-            found = self.predict(batch.images, _noise_of(batch))
+            found = self.predict(batch.images, batch_generator(batch.ids))
             scores = _shape_scores(batch, found, self.mean_shape) | _mask_scores(batch, found, self.hand_net)
             for name, values in scores.items():
                 numbers[name] += values.tolist()
             if not images:
                 images = {"prediction": prediction_rows(batch, found.masks, found.occupancy)}
         return Measurements(numbers=numbers, images=images)
-
-
-def _noise_of(batch: Batch) -> torch.Generator:
-    """Always the same for the same samples, whatever was measured before."""
-    digest = hashlib.blake2b("\n".join(batch.ids).encode(), digest_size=4).digest()
-    return torch.Generator().manual_seed(int.from_bytes(digest))
 
 
 def _shape_scores(

@@ -14,7 +14,7 @@ from model.evaluation.overlap import intersection_over_union
 from model.evaluation.voxel_image import voxel_image
 from model.sparse_structure.vae import StructureVae, VaeConfig, occupancy_from_logits
 from model.training.step_generators import normal_like, uniform
-from model.training.task import Evaluation, Losses, Measurements
+from model.training.task import Losses, Measurements
 
 __all__ = ["VaeTask", "turned"]
 
@@ -54,13 +54,9 @@ class VaeTask:
         losses = self.network(occupancy, noise)
         return Losses(total=losses.total, parts={"dice": losses.dice.mean(), "kl": losses.kl.mean()})
 
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """voxel_iou of shapes through encoder and decoder; images: truth beside reconstruction."""
-        return self.measure(batches).evaluation()
-
     @torch.no_grad()
     def measure(self, batches: Iterable[Batch]) -> Measurements:
-        """voxel_iou of every shape."""
+        """voxel_iou of every shape through encoder and decoder; images: truth beside reconstruction."""
         scores: list[float] = []
         images: dict[str, np.ndarray] = {}
         for batch in batches:

@@ -1,9 +1,8 @@
 """Training of the SLat flow: latents of the true voxels, denoised given views of the occluded object (section 3.3)."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -22,14 +21,20 @@ from model.flow import (
 )
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
-from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, ScoredMesh, mean_scores, scored_mesh
+from model.structured_latent.mesh_evaluation import (
+    MESH_METRICS,
+    MeshEvaluationConfig,
+    ScoredMesh,
+    numbers_of_objects,
+    scored_mesh,
+)
 from model.structured_latent.object_features.object_input import ObjectInputs, object_surface
 from model.structured_latent.prediction import SlatPrediction
 from model.structured_latent.surface_images import comparison
 from model.structured_latent.vae_training import SlatVae, normal_rows
 from model.structured_latent.view_conditioned import ViewCondition, ViewConditionedSlatFlow
-from model.training.step_generators import uniform
-from model.training.task import Evaluation, Losses
+from model.training.step_generators import batch_generator, uniform
+from model.training.task import Losses, Measurements
 
 __all__ = ["LATENT", "SlatFlowTask", "SlatFlowTraining"]
 
@@ -114,40 +119,47 @@ class SlatFlowTask:
         return SlatPrediction(latent=latent, decoded=self.vae.surface(latent))
 
     @torch.no_grad()
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Scores of meshes from sampled latents on the true voxels, fixed noise; every sample of the batches.
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
+        """Meshes from sampled latents on the true voxels, noise that belongs to the batch; every sample of the batches.
 
-        Beside them, every object once: what they have to beat, the mean latent at every voxel (mean_latent_*), and
-        what they cannot beat, the latents of the true object (true_latent_*). `latent_error` is the mean squared
-        error of sampled normalised latents: about 1 for the mean latent, 2 for samples that ignore the images.
+        Beside them, every object once: the baseline, the mean latent at every voxel (mean_latent_*), and what they
+        cannot beat, the latents of the true object (true_latent_*). `latent_error` is the mean squared error of
+        sampled normalised latents: about 1 for the mean latent, 2 for samples that ignore the images.
         """
-        found: list[ScoredMesh] = []
+        numbers: dict[str, list[float]] = {name: [] for name in (*MESH_METRICS, "latent_error")}
         baseline: dict[str, ScoredMesh] = {}
         ceiling: dict[str, ScoredMesh] = {}
-        errors: list[float] = []
         rows = []
-        generator = torch.Generator().manual_seed(0)
         for batch in batches:
-            prediction = self.predict(batch.images, batch.occupancy, generator)
+            prediction = self.predict(batch.images, batch.occupancy, batch_generator(batch.ids))
             clean = self.clean_latent(batch)
             wrong = self.network.normalisation.normalised(prediction.latent).features - clean.features
-            errors += [float(part.square().mean()) for part in wrong.split(clean.grid.sample_sizes)]
-            uids = batch.true_surface.object_uids
-            truths = [object_surface(batch.true_surface, index) for index in range(len(uids))]
-            if not ceiling.keys() >= set(uids):
-                mean = self.decoded(clean.with_features(torch.zeros_like(clean.features)))
-                true = self.decoded(clean)
-                for index, (uid, truth) in enumerate(zip(uids, truths)):
-                    if uid not in ceiling:
-                        baseline[uid] = scored_mesh(mean.decoded, index, truth, self.evaluation)
-                        ceiling[uid] = scored_mesh(true.decoded, index, truth, self.evaluation)
-            for index, (uid, truth) in enumerate(zip(uids, truths)):
-                found.append(scored_mesh(prediction.decoded, index, truth, self.evaluation))
-                rows.append((truth, (found[-1].mesh, baseline[uid].mesh, ceiling[uid].mesh)))
-        metrics = mean_scores(found) | {"latent_error": float(np.mean(errors)) if errors else float("nan")}
-        metrics |= _named("mean_latent", mean_scores(list(baseline.values())))
-        metrics |= _named("true_latent", mean_scores(list(ceiling.values())))
-        return Evaluation(metrics=metrics, images={"truth_sampled_mean_latent_true_latent": comparison(rows)})
+            numbers["latent_error"] += [
+                float(part.square().mean()) for part in wrong.split(clean.grid.sample_sizes)
+            ]
+            if not ceiling.keys() >= set(batch.true_surface.object_uids):
+                mean = clean.with_features(torch.zeros_like(clean.features))
+                self._add_objects(baseline, batch, mean)
+                self._add_objects(ceiling, batch, clean)
+            for index, uid in enumerate(batch.true_surface.object_uids):
+                truth = object_surface(batch.true_surface, index)
+                found = scored_mesh(prediction.decoded, index, truth, self.evaluation)
+                for name, number in found.numbers().items():
+                    numbers[name].append(number)
+                rows.append((truth, (found.mesh, baseline[uid].mesh, ceiling[uid].mesh)))
+        return Measurements(
+            numbers=numbers,
+            of_objects=numbers_of_objects(baseline, "mean_latent_")
+            | numbers_of_objects(ceiling, "true_latent_"),
+            images={"truth_sampled_mean_latent_true_latent": comparison(rows)},
+        )
+
+    def _add_objects(self, meshes: dict[str, ScoredMesh], batch: Batch, normalised: SparseTensor) -> None:
+        """What latents decode to, of each object of the batch that `meshes` has none of."""
+        decoded, truth = self.decoded(normalised).decoded, batch.true_surface
+        for index, uid in enumerate(truth.object_uids):
+            if uid not in meshes:
+                meshes[uid] = scored_mesh(decoded, index, object_surface(truth, index), self.evaluation)
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +174,3 @@ class _Velocity:
         x_t = SparseTensor(grid=self.grid, features=state[LATENT])
         of_sample = t[:1].expand(self.grid.batch_size)
         return {LATENT: self.network(x_t, of_sample, self.condition).features.float()}
-
-
-def _named(prefix: str, metrics: Mapping[str, float]) -> dict[str, float]:
-    return {f"{prefix}_{name}": value for name, value in metrics.items()}

@@ -1,7 +1,7 @@
 """From decoded voxels to meshes, their scores and their images."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,19 @@ from model.structured_latent.prediction import decoded_fields
 from model.surface.extraction import ExtractionConfig, extract_surface
 from model.surface.mesh import MeshReport, SurfaceMesh, check_manifold
 
-__all__ = ["MeshEvaluationConfig", "ScoredMesh", "mean_scores", "scored_mesh"]
+__all__ = ["MESH_METRICS", "MeshEvaluationConfig", "ScoredMesh", "numbers_of_objects", "scored_mesh"]
+
+MESH_METRICS = (
+    "f_5mm",  # percent
+    "f_10mm",
+    "chamfer_cm",  # MagicHOI's sum
+    "normal_deg",  # of objects that have a mesh
+    "color_error",  # sRGB 0..1, likewise
+    "manifold",  # percent
+    "handles",  # genus, of manifold meshes: tells ragged surfaces that the F-score does not see
+    "components",  # likewise
+    "without_mesh",  # percent
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +45,30 @@ class ScoredMesh:
     score: SurfaceScore | None
     report: (
         MeshReport | None
-    )  # None: it is not closed, oriented and manifold (model.surface.mesh.check_manifold)
+    )  # None: not watertight, oriented and manifold (model.surface.mesh.check_manifold)
     largest_chamfer_cm: float  # both ways across the object's cube: what having no mesh costs
+
+    def numbers(self) -> dict[str, float]:
+        """Its numbers in MESH_METRICS, without those that it has none of.
+
+        No mesh counts as F-score 0 and as far off as the cube allows.
+        """
+        if self.score is None:
+            nothing = {"f_5mm": 0.0, "f_10mm": 0.0, "manifold": 0.0, "without_mesh": 100.0}
+            return nothing | {"chamfer_cm": self.largest_chamfer_cm}
+        points = self.score.points
+        numbers = {
+            "f_5mm": points.f_5mm,
+            "f_10mm": points.f_10mm,
+            "chamfer_cm": points.chamfer_cm,
+            "normal_deg": self.score.normal_deg,
+            "color_error": self.score.color,
+            "manifold": 0.0 if self.report is None else 100.0,
+            "without_mesh": 0.0,
+        }
+        if self.report is None:
+            return numbers
+        return numbers | {"handles": float(self.report.genus), "components": float(self.report.components)}
 
 
 def scored_mesh(
@@ -44,7 +78,7 @@ def scored_mesh(
     largest_chamfer_cm = 100.0 * 2.0 * math.sqrt(3.0) * truth.object_scale_m
     try:
         mesh = extract_surface(decoded_fields(decoded, sample), config.extraction).mesh
-    except ModelError:  # no voxel, nothing inside, or numbers that are not finite: counted by `mean_scores`
+    except ModelError:  # no voxel, nothing inside, or numbers that are not finite
         return ScoredMesh(mesh=None, score=None, report=None, largest_chamfer_cm=largest_chamfer_cm)
     try:
         report = check_manifold(mesh)
@@ -54,28 +88,10 @@ def scored_mesh(
     return ScoredMesh(mesh=mesh, score=score, report=report, largest_chamfer_cm=largest_chamfer_cm)
 
 
-def mean_scores(meshes: Sequence[ScoredMesh]) -> dict[str, float]:
-    """Means over objects. One without a mesh counts as F-score 0 and as far off as its cube allows, and is counted.
-
-    f_5mm, f_10mm and manifold are percent, chamfer_cm is MagicHOI's sum, color is sRGB 0..1; handles (genus) and
-    components, of manifold meshes only, tell ragged surfaces that the F-score does not see. NaN: of no mesh at all.
-    """
-    found = [mesh.score for mesh in meshes if mesh.score is not None]
-    reports = [mesh.report for mesh in meshes if mesh.report is not None]
-    count = len(meshes)
-    chamfer_cm = [m.largest_chamfer_cm if m.score is None else m.score.points.chamfer_cm for m in meshes]
+def numbers_of_objects(meshes: Mapping[str, ScoredMesh], prefix: str = "") -> dict[str, dict[str, float]]:
+    """The numbers of one mesh for each object, by metric and object, as `Measurements.of_objects` holds them."""
+    numbers = {uid: mesh.numbers() for uid, mesh in meshes.items()}
     return {
-        "f_5mm": _mean([score.points.f_5mm for score in found], count),
-        "f_10mm": _mean([score.points.f_10mm for score in found], count),
-        "chamfer_cm": _mean(chamfer_cm, count),
-        "normal_deg": _mean([score.normal_deg for score in found], len(found)),
-        "color_error": _mean([score.color for score in found], len(found)),
-        "manifold": 100.0 * _mean([1.0] * len(reports), count),
-        "handles": _mean([float(report.genus) for report in reports], len(reports)),
-        "components": _mean([float(report.components) for report in reports], len(reports)),
-        "without_mesh": float(count - len(found)),
+        f"{prefix}{name}": {uid: of[name] for uid, of in numbers.items() if name in of}
+        for name in MESH_METRICS
     }
-
-
-def _mean(values: Sequence[float], count: int) -> float:
-    return math.fsum(values) / count if count else math.nan

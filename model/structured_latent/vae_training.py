@@ -9,14 +9,19 @@ from torch import Tensor, nn
 
 from model.data.batch import Batch
 from model.networks.sparse.grid import SparseGrid
-from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, ScoredMesh, mean_scores, scored_mesh
+from model.structured_latent.mesh_evaluation import (
+    MeshEvaluationConfig,
+    ScoredMesh,
+    numbers_of_objects,
+    scored_mesh,
+)
 from model.structured_latent.object_features.object_input import ObjectInputs, object_surface
 from model.structured_latent.surface_images import comparison
 from model.structured_latent.vae.decoder import SurfaceDecoder
 from model.structured_latent.vae.encoder import SlatEncoder
 from model.structured_latent.vae.latent import SlatVaeConfig, sample
 from model.structured_latent.vae.surface_loss import SurfaceLossConfig, surface_loss
-from model.training.task import Evaluation, Losses
+from model.training.task import Losses, Measurements
 
 __all__ = ["SlatVae", "SlatVaeTask", "normal_rows"]
 
@@ -68,7 +73,7 @@ class SlatVaeTask:
         )
 
     @torch.no_grad()
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
         """Scores of the meshes of mean latents, every object once; images: truth beside reconstruction."""
         meshes: dict[str, ScoredMesh] = {}
         rows = []
@@ -80,8 +85,9 @@ class SlatVaeTask:
                     truth = object_surface(batch.true_surface, index)
                     meshes[uid] = scored_mesh(decoded, index, truth, self.evaluation)
                     rows.append((truth, (meshes[uid].mesh,)))
-        return Evaluation(
-            metrics=mean_scores(list(meshes.values())),
+        return Measurements(
+            numbers={},
+            of_objects=numbers_of_objects(meshes),
             images={"truth_and_reconstruction": comparison(rows)},
         )
 

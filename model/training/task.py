@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -12,7 +12,7 @@ from torch import nn
 
 from model.data.batch import Batch
 
-__all__ = ["Evaluation", "Losses", "Measurements", "SharedValidation", "Task"]
+__all__ = ["Evaluation", "Losses", "Measurements", "Task", "merged"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,18 +33,33 @@ class Evaluation:
 
 @dataclass(frozen=True, kw_only=True)
 class Measurements:
-    """What was found on some of the validation batches: numbers whose means are the metrics, images of the first."""
+    """Numbers whose means are the metrics, measured on some of the validation batches, and images of the first.
+
+    `numbers`, by metric: of samples, views or joints, each of which is in one batch alone.
+    `of_objects`, by metric and object: an object counts once, however many batches show it and whoever measured them.
+    """
 
     numbers: dict[str, list[float]]
+    of_objects: dict[str, dict[str, float]] = field(default_factory=dict)
     images: dict[str, UInt8[np.ndarray, "height width 3"]]
 
     def evaluation(self) -> Evaluation:
-        """The means, which do not depend on the order of the numbers."""
-        means = {
-            name: math.fsum(values) / len(values) if values else math.nan
-            for name, values in self.numbers.items()
-        }
+        """The means, which do not depend on the order of the numbers; NaN where there is none."""
+        values = self.numbers | {name: list(of.values()) for name, of in self.of_objects.items()}
+        means = {name: math.fsum(of) / len(of) if of else math.nan for name, of in values.items()}
         return Evaluation(metrics=means, images=self.images)
+
+
+def merged(shares: Sequence[Measurements]) -> Measurements:
+    """Those of all batches from those of some each, whoever measured which; images of the first share."""
+    numbers: dict[str, list[float]] = {}
+    of_objects: dict[str, dict[str, float]] = {}
+    for share in shares:
+        for name, values in share.numbers.items():
+            numbers.setdefault(name, []).extend(values)
+        for name, values_of in share.of_objects.items():
+            of_objects[name] = values_of | of_objects.get(name, {})
+    return Measurements(numbers=numbers, of_objects=of_objects, images=shares[0].images if shares else {})
 
 
 @runtime_checkable
@@ -58,13 +73,8 @@ class Task(Protocol):
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
         """Loss of a batch. All randomness comes from the generators, one per sample (`step_generators.py`)."""
 
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
-        """Metrics with the weights that the module holds now; no gradients, randomness of its own fixed seed."""
-
-
-@runtime_checkable
-class SharedValidation(Protocol):
-    """A Task whose validation ranks share: each measures some batches, and the metrics are means over all of them."""
-
     def measure(self, batches: Iterable[Batch]) -> Measurements:
-        """Numbers of every metric, which depend on their batch alone; as for `evaluate`, which gives their means."""
+        """Numbers of every metric with the weights that the module holds now; no gradients.
+
+        They depend on their own batch alone, randomness included (`batch_generator`), so ranks may share the batches.
+        """

@@ -49,7 +49,7 @@ __all__ = [
 
 
 class NonFiniteLossError(RuntimeError):
-    """The loss became NaN or infinite; the message names the samples and where training can go on."""
+    """The loss became NaN or infinite; the message names motions, clips and frames, and where training can go on."""
 
 
 class TrainingStopped(Exception):  # noqa: N818  (no error: the run was asked to stop and is saved)
@@ -281,7 +281,7 @@ def _step(
     """One optimiser step over `accumulate` global batches."""
     config, accelerator = run.config, run.accelerator
     sums: dict[str, torch.Tensor] = {}
-    ids: list[str] = []
+    names: list[str] = []
     for part in range(config.accumulate):
         with clock.waiting():
             placed = next(batches)
@@ -291,7 +291,7 @@ def _step(
         with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=bfloat16):
             losses = run.task.loss(batch, generators)
         _require_finite(run, losses, batch, step)
-        ids += batch.ids
+        names += batch.names
         (losses.total / config.accumulate).backward()
         for name, value in {"loss": losses.total, **losses.parts}.items():
             sums[name] = sums.get(name, 0.0) + value.detach().float() / config.accumulate
@@ -301,7 +301,7 @@ def _step(
     if not bool(torch.isfinite(norm)):  # the same on all ranks; before it reaches weights and checkpoints
         raise NonFiniteLossError(
             f"step {step}: the gradient is {float(norm)} though the loss is finite; samples of this rank: "
-            f"{', '.join(ids)}; expected a finite number. Look at these samples, or lower optimizer.learning_rate; "
+            f"{', '.join(names)}; expected a finite number. Look at these samples, or lower optimizer.learning_rate; "
             f"training resumes from the newest checkpoint in {run.checkpoints}"
         )
     rate = run.optimizer_config.rate(step, config.steps)
@@ -333,7 +333,7 @@ def _require_finite(run: _Run, losses: Losses, batch: Batch, step: int) -> None:
     if not _any(run.accelerator, bad):
         return
     parts = ", ".join(f"{name} {float(value.detach()):.4g}" for name, value in losses.parts.items())
-    whose = f"samples {', '.join(batch.ids)}" if bad else "samples of another rank (see its message)"
+    whose = f"samples {', '.join(batch.names)}" if bad else "samples of another rank (see its message)"
     raise NonFiniteLossError(
         f"step {step}: the loss is {float(losses.total.detach())} ({parts}) for {whose}; expected a finite number. "
         f"Look at these samples, or lower optimizer.learning_rate; training resumes from the newest checkpoint "

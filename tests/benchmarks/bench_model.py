@@ -22,10 +22,11 @@ from model.data.stream import open_motions
 from model.encoders.efficientnet import EfficientNetConfig, load_efficientnet
 from model.encoders.hand import HandEncoder, HandNet
 from model.encoders.protocol import FeatureEncoder
-from model.flow import Guidance
-from model.recipes.config import OwnHandEncoder, TrainingConfig, load_config
-from model.recipes.frozen_encoders import aggregator_over, given_hand_encoder
-from model.recipes.shard_source import StreamSource
+from model.recipes.components.flow_settings import guidance_of
+from model.recipes.components.frozen_encoders import OwnHandEncoder, aggregator_over, given_hand_encoder
+from model.recipes.components.shard_source import StreamSource
+from model.recipes.config import load_config
+from model.recipes.stage_one_config import StageOneTrainingConfig
 from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
@@ -37,13 +38,15 @@ DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 VIEWS = (2, 4, 6, 12)
 
 
-def configuration(name: str) -> TrainingConfig:
-    return load_config(name)
+def configuration(name: str) -> StageOneTrainingConfig:
+    config = load_config(name)
+    assert isinstance(config, StageOneTrainingConfig)
+    return config
 
 
-def stage_one_task(config: TrainingConfig) -> StageOneTask:
+def stage_one_task(config: StageOneTrainingConfig) -> StageOneTask:
     """The task of a configuration with open encoders, with random weights in all but the image encoder."""
-    part, hand = config.stage_one, config.encoders.hand
+    section, hand = config.stage_one, config.encoders.hand
     assert isinstance(config.encoders.image, EfficientNetConfig)
     torch.manual_seed(0)
     image_encoder = load_efficientnet(config.encoders.image)
@@ -56,21 +59,21 @@ def stage_one_task(config: TrainingConfig) -> StageOneTask:
     aggregator = aggregator_over(
         image_encoder,
         hand_encoder,
-        hand_width=part.hand_width,
-        hidden=part.hidden,
-        channels=part.network.masks.feature_channels,
+        hand_width=section.hand_width,
+        hidden=section.hidden,
+        channels=section.network.masks.feature_channels,
     )
     return StageOneTask(
-        network=StageOne(aggregator, part.network).to(DEVICE),
+        network=StageOne(aggregator, section.network).to(DEVICE),
         image_encoder=image_encoder.to(DEVICE, torch.float32),
         hand_encoder=hand_encoder.to(DEVICE, torch.float32),
         vae=StructureVae(config.vae.network).to(DEVICE).eval().requires_grad_(False),
         config=StageOneConfig(
-            beta=part.beta,
-            drop_condition=part.drop_condition,
-            time=part.time,
-            sampler=part.sampler,
-            guidance=Guidance(strength={"geometry": part.guidance_strength}, interval=part.guidance_interval),
+            beta=section.beta,
+            drop_condition=section.drop_condition,
+            time=section.time,
+            sampler=section.sampler,
+            guidance=guidance_of(section.guidance, "geometry"),
             latent_scale=1.0,
         ),
         mean_shape=torch.zeros(64, 64, 64, dtype=torch.bool),
@@ -188,7 +191,7 @@ def test_share_of_time_spent_waiting_for_data(tmp_path, say):
     from tests.model.data.balls import write_balls
 
     config = configuration("tiny")
-    part, steps = config.stage_one, 12
+    section, steps = config.stage_one, 12
     root = write_balls(
         tmp_path / "balls",
         splits=[["train"] * 4],
@@ -197,19 +200,13 @@ def test_share_of_time_spent_waiting_for_data(tmp_path, say):
         size_px=SIZE_PX,
         change_frame=photographic,
     )
-    stream = replace(
-        config.data,
-        datasets=(str(root),),
-        batch_size=part.recipe.batch_size,
-        views=part.recipe.views,
-        image_size=part.recipe.image_size,
-    )
+    stream = section.recipe.stream(replace(config.data, datasets=(str(root),)), surface=False)
     reports: list[StepReport] = []
     train(
         stage_one_task(config),
         StreamSource(config=stream, index=open_motions(stream), rank=0, ranks=1),
-        replace(part.recipe.trainer, steps=steps, log_every=1, checkpoint_every=steps),
-        part.recipe.optimizer,
+        replace(section.recipe.trainer, steps=steps, log_every=1, checkpoint_every=steps),
+        section.recipe.optimizer,
         folder=tmp_path / "run",
         config_yaml="bench",
         config_sha256="bench",

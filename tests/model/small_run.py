@@ -1,4 +1,4 @@
-"""The preset tiny with a hand encoder, cut down to seconds: two steps of each part, on a dataset of balls."""
+"""configs/model/tiny.yaml with a hand encoder, cut down to seconds: two steps of each component, on balls."""
 
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,9 @@ def small_settings(dataset: Path) -> dict[str, Any]:
     }
     config["validation"] |= {"views": 2, "batch_size": 2, "batches": 1}
     config["stage_one"]["sampler"]["steps"] = 2
-    for part in ("vae", "hand_encoder", "stage_one"):
-        recipe = config[part]["recipe"]
-        recipe |= {"batch_size": 2, "views": [1, 2]}
+    for component in ("vae", "hand_encoder", "stage_one"):
+        recipe = config[component]["recipe"]
+        recipe |= {"batch_size": 2} if component == "vae" else {"batch_size": 2, "views": [1, 2]}
         recipe["trainer"] |= {
             "steps": STEPS,
             "checkpoint_every": 1,

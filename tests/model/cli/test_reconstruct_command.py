@@ -71,7 +71,7 @@ def test_everything_is_written(finished, video):
         with Image.open(finished / name) as mask:
             assert (mask.size, mask.mode) == ((160, 96), "L")
             assert set(np.unique(np.asarray(mask))) <= {0, 255}
-    assert [c["part"] for c in record["checkpoints"]] == ["vae", "stage_one", "slat_vae", "slat_flow"]
+    assert [c["component"] for c in record["checkpoints"]] == ["vae", "stage_one", "slat_vae", "slat_flow"]
     assert all(len(c["weights_sha256"]) == 64 and c["step"] == c["steps"] == 2 for c in record["checkpoints"])
     assert {"read frames", "load networks", "stage 1: masks and voxels", "mesh"} <= set(record["seconds"])
     assert record["scale"]["metres_per_unit"] is None

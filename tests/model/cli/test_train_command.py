@@ -1,4 +1,4 @@
-"""`forehoi train` on a small dataset: all parts, again without work, and what a user can get wrong."""
+"""`forehoi train` on a small dataset: all components, again without work, and what a user can get wrong."""
 
 import json
 import re
@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from click.testing import CliRunner
 
 from model.cli.main import main
@@ -48,29 +49,33 @@ def dataset(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def finished(dataset, tmp_path_factory) -> tuple[Path, Path]:
-    """A configuration and the run of all its parts. Do not change it."""
+    """A configuration and the run of all its components. Do not change it."""
     root = tmp_path_factory.mktemp("finished")
     config = write_config(root / "small.yaml", small_settings(dataset))
     status, output = forehoi("train", config, "--out", root / "run")
     assert status == 0, output
-    for part, metric in (("vae", "voxel_iou"), ("hand_encoder", "hand_mask_iou"), ("stage_one", "mask_iou")):
+    for component, metric in (
+        ("vae", "voxel_iou"),
+        ("hand_encoder", "hand_mask_iou"),
+        ("stage_one", "mask_iou"),
+    ):
         assert metric in output
-        assert metric in json.loads((root / "run" / part / "metrics.json").read_text())
+        assert metric in json.loads((root / "run" / component / "metrics.json").read_text())
     return config, root / "run"
 
 
-def test_all_parts_train_and_a_second_run_changes_nothing(finished):
+def test_all_components_train_and_a_second_run_changes_nothing(finished):
     config, out = finished
-    for part in ("vae", "hand_encoder", "stage_one"):
-        assert (out / part / "checkpoints" / "step-00000002" / "state.json").is_file()
-        assert list((out / part / "tensorboard").iterdir())
+    for component in ("vae", "hand_encoder", "stage_one"):
+        assert (out / component / "checkpoints" / "step-00000002" / "state.json").is_file()
+        assert list((out / component / "tensorboard").iterdir())
     before = {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")}
     status, _ = forehoi("train", config, "--out", out)
     assert status == 0
     assert {path: path.stat().st_mtime_ns for path in out.rglob("*.safetensors")} == before
 
 
-def test_stage_one_without_its_parts_says_what_to_train(dataset, tmp_path):
+def test_stage_one_without_what_it_stands_on_says_what_to_train(dataset, tmp_path):
     config = write_config(tmp_path / "small.yaml", small_settings(dataset))
     text = fails("train", "stage_one", "--config", config, "--out", tmp_path / "run")
     assert "holds no checkpoint; expected the trained vae. Train it first: forehoi train vae." in text
@@ -87,7 +92,7 @@ def test_the_folder_of_a_run_is_named_after_the_file_as_the_help_says(dataset, t
 
 
 def test_a_checkpoint_of_another_configuration(finished, tmp_path):
-    """Of the part itself, and of one that it stands on."""
+    """Of the component itself, and of one that it stands on."""
     config, out = finished
     text = config.read_text()
     other = tmp_path / "other.yaml"
@@ -98,6 +103,18 @@ def test_a_checkpoint_of_another_configuration(finished, tmp_path):
     other.write_text(text.replace("middle_blocks: 1", "middle_blocks: 2"))
     line = fails("train", "stage_one", "--config", other, "--out", out)
     assert "vae/checkpoints/step-00000002" in line
+
+
+def test_a_component_that_is_not_there_or_of_the_other_stage(finished, tmp_path):
+    config, out = finished
+    text = fails("train", "slat_flow", "--config", config, "--out", out)
+    assert "has no slat_flow to train; expected a component: vae, hand_encoder, stage_one." in text
+    without = yaml.safe_load(config.read_text()) | {"hand_encoder": None}
+    without["encoders"]["hand"] = {"packaged_grid": 8}
+    path = write_config(tmp_path / "without.yaml", without)
+    assert "has no hand_encoder to train; expected a component: vae, stage_one." in fails(
+        "train", "hand_encoder", "--config", path, "--out", out
+    )
 
 
 def test_a_run_without_adapters_has_nothing_to_merge(finished, tmp_path):
@@ -117,6 +134,7 @@ def test_missing_unknown_and_contradicting_keys(dataset, tmp_path):
         ("beta: 1.0", "beta: much", "'stage_one.beta': expected a number, found 'much'"),
         ("latent_resolution: 4", "latent_resolution: 8", "expected the same shape"),
         ("grid: 8\n      heads", "grid: 4\n      heads", "mask tokens lie on the image tokens"),
+        ("  seed: 0\n  split", "  batch_size: 8\n  seed: 0\n  split", "unknown key 'data.batch_size'"),
         ("name: tiny", "name: [tiny", "not valid YAML"),
     ):
         assert text.count(old) == 1, old
@@ -178,7 +196,7 @@ def test_a_missing_column(tmp_path):
 
 def test_the_paper_without_its_weights_says_how_to_make_them(dataset, tmp_path, monkeypatch):
     settings = read_settings("paper").data
-    settings["data"] |= {"datasets": [str(dataset)], "workers": 0, "cameras": "train"}
+    settings["data"] |= {"datasets": [str(dataset)], "workers": 0, "held_out_cameras": 0.4}
     settings["stage_one"]["recipe"] |= {"views": [1, 2]}
     settings["validation"] |= {"views": 1, "split": "train"}
     monkeypatch.chdir(tmp_path)

@@ -6,7 +6,7 @@ from itertools import islice
 from pathlib import Path
 
 from model.data.batch import Batch
-from model.data.config import StreamConfig
+from model.data.config import DataConfig, StreamConfig
 from model.data.crop import Augmentation
 from model.data.stream import ShardStream
 from shards.schema import FrameRow, ObjectRow
@@ -23,27 +23,34 @@ from tests.shards.synthetic import (
 VARIED = Augmentation(margin=(1.1, 1.6), shift=0.7, roll_deg=(-40.0, 40.0), flip_probability=0.5)
 
 
-def stream_config(*datasets: object, **changes: object) -> StreamConfig:
-    """A small stream over all cameras of the training motions."""
+def data_config(*datasets: object, **changes: object) -> DataConfig:
+    """The training motions of small datasets, no camera held out."""
     settings: dict[str, object] = {
         "datasets": tuple(str(dataset) for dataset in datasets),
         "split": "train",
-        "cameras": "all",
-        "held_out_cameras": 0.2,
+        "held_out_cameras": 0.0,
         "seed": 5,
-        "batch_size": 4,
-        "views": (2, 4),
-        "image_size": 32,
         "augmentation": VARIED,
         "samples_per_motion": 1,
-        "endless": True,
         "workers": 0,
         "prefetch_batches": 1,
         "cache_mb": 64,
-        "on_corrupt": "raise",
         "max_corrupt": 0,
     }
-    return StreamConfig(**(settings | changes))  # type: ignore[arg-type]
+    return DataConfig(**(settings | changes))  # type: ignore[arg-type]
+
+
+def stream_config(*datasets: object, **changes: object) -> StreamConfig:
+    """A small stream over all cameras of the training motions."""
+    settings: dict[str, object] = {
+        "held_out_cameras": 0.2,
+        "cameras": "all",
+        "batch_size": 4,
+        "views": (2, 4),
+        "image_size": 32,
+        "endless": True,
+    }
+    return StreamConfig(**(vars(data_config(*datasets)) | settings | changes))
 
 
 def take(stream: ShardStream, n: int) -> list[Batch]:

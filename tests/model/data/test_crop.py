@@ -53,7 +53,6 @@ def cropped_sample(seed: int, size: int, augmentation: Augmentation) -> tuple[Tr
     sample = TrainingSample(
         motion_id="m",
         object_uid="o",
-        split="train",
         clip_ids=("c",),
         frame_indices=np.array([0]),
         images=(crop_image(rgb, crop).transpose(2, 0, 1)[None] / np.float32(255)).astype(np.float32),

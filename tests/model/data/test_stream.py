@@ -37,8 +37,9 @@ def balls(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def assert_same(a: Batch, b: Batch, rows: slice = slice(None)) -> None:
     assert a.ids[rows] == b.ids
+    assert a.views[rows] == b.views
     for field in fields(Batch):
-        if field.name not in ("ids", "surface"):
+        if field.name not in ("ids", "views", "surface"):
             left, right = getattr(a, field.name)[rows], getattr(b, field.name)
             torch.testing.assert_close(left, right, rtol=0, atol=0, equal_nan=True, msg=field.name)
 
@@ -55,6 +56,21 @@ def test_batches_have_the_promised_shapes(balls):
         assert batch.occupancy.flatten(1).any(dim=1).all()
         assert (batch.object_amodal | ~batch.object_visible).all()
         assert batch.joints_px.shape == (4, n_views, 21, 2)
+
+
+def test_a_sample_is_named_with_its_clips_and_frames(balls):
+    config = stream_config(balls, views=(2, 2))
+    index = open_motions(config)
+    (batch,) = take(ShardStream(config, index=index), 1)
+    place = {motion.motion_id: number for number, motion in enumerate(index.motions)}
+    for name, sample_id, views in zip(batch.names, batch.ids, batch.views, strict=True):
+        motion_id, epoch, position = sample_id.split(":")
+        key = SampleKey(epoch=int(epoch), position=int(position), item=place[motion_id], n_views=2)
+        sample, _ = SampleReader(index, config).read(key)
+        shown = [f"{clip} frame {frame}" for clip, frame in zip(sample.clip_ids, sample.frame_indices)]
+        assert list(views) == shown
+        assert name == f"{sample_id} ({', '.join(shown)})"
+    assert batch.part(1, 3).names == batch.names[1:3] == batch.to("cpu", torch.bfloat16).names[1:3]
 
 
 def test_moving_a_batch_keeps_geometry_in_float32(balls):
@@ -269,9 +285,12 @@ def test_a_batch_that_the_ranks_cannot_share(balls):
         ShardStream(stream_config(balls), rank=0, world_size=3)
 
 
-@pytest.mark.parametrize(("name", "value"), [("views", (3, 2)), ("batch_size", 0), ("datasets", ())])
-def test_bad_configuration(name, value):
-    with pytest.raises(ModelError, match=f"data.{name}"):
+@pytest.mark.parametrize(
+    ("section", "name", "value"),
+    [("stream", "views", (3, 2)), ("stream", "batch_size", 0), ("data", "datasets", ())],
+)
+def test_bad_configuration(section, name, value):
+    with pytest.raises(ModelError, match=rf"{section}\.{name}"):
         stream_config("x", **{name: value})
 
 
@@ -312,7 +331,7 @@ def test_a_corrupt_row_is_named(corrupt_row, workers):
 
 
 def test_a_corrupt_row_is_skipped_and_counted_once(corrupt_row):
-    config = stream_config(corrupt_row, on_corrupt="skip", max_corrupt=1)
+    config = stream_config(corrupt_row, max_corrupt=1)
     stream = ShardStream(config)
     batches = take(stream, 12)
     assert len(stream.corrupt_rows) == 1
@@ -321,11 +340,14 @@ def test_a_corrupt_row_is_skipped_and_counted_once(corrupt_row):
     assert [batch.ids for batch in batches] == [batch.ids for batch in take(ShardStream(config), 12)]
 
 
-def test_too_many_corrupt_rows_stop_the_stream(corrupt_row):
-    stream = ShardStream(stream_config(corrupt_row, on_corrupt="skip", max_corrupt=0))
+def test_too_many_corrupt_rows_stop_the_stream(tmp_path):
+    def corrupt_last_frames(frame: FrameRow) -> FrameRow:
+        return replace(frame, rgb=frame.rgb[:-20]) if frame.frame_index == 2 else frame
+
+    root = write_balls(tmp_path, splits=[["train", "train"]], cameras=2, change_frame=corrupt_last_frames)
     with pytest.raises(CorruptShardError) as caught:
-        take(stream, 20)
-    assert_one_line(caught.value, "1 corrupt rows", "at most 0", "frame 2")
+        take(ShardStream(stream_config(root, max_corrupt=1)), 20)
+    assert_one_line(caught.value, "2 corrupt rows", "at most 1", "frame 2")
 
 
 @pytest.mark.parametrize(("column", "workers"), [("rgb", 0), ("rgb", 1), ("joints_px", 0)])
@@ -344,4 +366,4 @@ def test_flipped_bits_in_a_file(tmp_path, column, workers):
     assert_one_line(caught.value, "frames.parquet", "group 0", f"'{column}'")
     # all four frames are needed, and nothing else is left to take their place
     with pytest.raises(CorruptShardError, match="no readable sample"):
-        take(ShardStream(replace(config, on_corrupt="skip", max_corrupt=5)), 1)
+        take(ShardStream(replace(config, max_corrupt=5)), 1)

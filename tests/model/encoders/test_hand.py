@@ -182,7 +182,7 @@ def test_a_perfect_output_has_no_loss_and_full_marks() -> None:
     )
     assert float(losses["joints"].max()) < 1e-4
     assert float(losses["side"].max()) < 1e-6
-    evaluation = HandTask(network=Oracle(batch), config=LOSS).evaluate([batch])
+    evaluation = HandTask(network=Oracle(batch), config=LOSS).measure([batch]).evaluation()
     assert evaluation.metrics == {
         "hand_mask_iou": 1.0,
         "held_object_iou": 1.0,
@@ -263,12 +263,12 @@ def test_it_learns_masks_and_joints() -> None:
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()
-    metrics = task.evaluate([hand_batch(16, 2, 64, seed=9)]).metrics
+    metrics = task.measure([hand_batch(16, 2, 64, seed=9)]).evaluation().metrics
     assert metrics["hand_mask_iou"] > 0.85, metrics
     assert metrics["hand_pck5"] > 0.5, metrics
     assert metrics["hand_side_accuracy"] > 0.9, metrics
 
 
 def test_evaluation_without_anything_to_measure_is_nan() -> None:
-    metrics = HandTask(network=network(), config=LOSS).evaluate([]).metrics
+    metrics = HandTask(network=network(), config=LOSS).measure([]).evaluation().metrics
     assert all(value != value for value in metrics.values())

@@ -7,7 +7,6 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from model.inference.networks import open_stage_one
-from model.recipes.components import load_stage_one
 from model.recipes.config import read_settings
 from model.training.checkpoint import latest_checkpoint
 from tests.model.small_run import forehoi, small_settings, write_config
@@ -35,15 +34,15 @@ def small_stage_two(dataset: Path) -> dict[str, Any]:
     flow = {"channels": 24, "condition_channels": 24, "blocks": 1, "heads": 1, "io_channels": [8, 16]}
     config["slat_flow"]["network"] |= flow
     config["slat_flow"]["sampler"]["steps"] = 2
-    for part in ("slat_vae", "slat_flow"):
-        recipe = config[part]["recipe"]
-        recipe |= {"batch_size": 1, "views": [1, 1]}
+    for component in ("slat_vae", "slat_flow"):
+        recipe = config[component]["recipe"]
+        recipe |= {"batch_size": 1} if component == "slat_vae" else {"batch_size": 1, "views": [1, 1]}
         recipe["trainer"] |= {"steps": 2, "checkpoint_every": 2, "validate_every": 2, "log_every": 1}
     return config
 
 
 def train_small(folder: Path, settings: dict[str, Any]) -> Path:
-    """The run of all parts of a configuration."""
+    """The run of all components of a configuration."""
     status, output = forehoi("train", write_config(folder.with_suffix(".yaml"), settings), "--out", folder)
     assert status == 0, output
     return folder
@@ -51,7 +50,7 @@ def train_small(folder: Path, settings: dict[str, Any]) -> Path:
 
 def fill_some(run: Path) -> None:
     """Two steps leave a decoder that fills nothing or all: moves its last bias until noise fills FILLED of the cube."""
-    task = load_stage_one(open_stage_one(run).config, run, torch.device("cpu"))
+    task = open_stage_one(run).config.flow.load(run, torch.device("cpu"))
     shape = task.network.flow.config.geometry.latent_shape
     noise = torch.randn(1, *shape, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():

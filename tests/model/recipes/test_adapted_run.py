@@ -9,13 +9,14 @@ import yaml
 from safetensors.torch import load_file, save_file
 
 from model.networks.lora import import_adapter
-from model.recipes.components import load_stage_one
-from model.recipes.config import TrainingConfig, load_config
+from model.recipes.config import load_config
+from model.recipes.stage_one_config import StageOneTrainingConfig
 from model.sparse_structure.geometry_branch import GeometryBranch
 from model.sparse_structure.stage_one import StageOneTask
 from model.weights.weight_file import write_weight_file
 from tests.model.data.balls import write_balls
 from tests.model.small_run import fails, forehoi, small_settings, write_config
+from tests.model.stages import stage_one
 from tests.model.weights.published import write_published
 
 CPU = torch.device("cpu")
@@ -57,7 +58,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "hidden": 16,
     }
     settings["stage_one"]["recipe"]["trainer"]["steps"] = 4
-    config = load_config(write_config(root / "config.yaml", settings))
+    config = stage_one(load_config(write_config(root / "config.yaml", settings)))
     # Small values, so that a network of random weights is not chaotic.
     write_published(root / "published", config.stage_one.network, config.vae.network, std=0.1)
     arguments = ("--config", root / "config.yaml", "--out", root / "trellis.safetensors")
@@ -73,16 +74,20 @@ def checkpoint(run: Path, step: int) -> Path:
     return run / "stage_one" / "checkpoints" / f"step-{step:08d}"
 
 
-def config_of(place: Path) -> TrainingConfig:
-    return load_config(place / "config.yaml")
+def config_of(place: Path) -> StageOneTrainingConfig:
+    return stage_one(load_config(place / "config.yaml"))
+
+
+def loaded(place: Path, run: Path) -> StageOneTask:
+    return config_of(place).flow.load(run, CPU)
 
 
 def trained_names(place: Path) -> set[str]:
-    task = load_stage_one(config_of(place), place / "run", CPU)
+    task = loaded(place, place / "run")
     return {name for name, parameter in task.module.named_parameters() if parameter.requires_grad}
 
 
-def test_parts_with_weights_are_not_trained(place):
+def test_components_with_weights_are_not_trained(place):
     assert sorted(path.name for path in (place / "run").iterdir()) == ["hand_encoder", "stage_one"]
     text = fails("train", "vae", "--config", place / "config.yaml", "--out", place / "run")
     assert "has weights already" in text
@@ -103,7 +108,7 @@ def test_exactly_the_adapters_and_the_new_modules_are_trained_and_saved(place):
         for side in "AB"
     }
     assert {name for name in names if name.startswith("flow.geometry.")} == adapters
-    task = load_stage_one(config_of(place), place / "run", CPU)
+    task = loaded(place, place / "run")
     new = {name for name, _ in task.module.named_parameters() if not name.startswith("flow.geometry.")}
     assert names - adapters == new
     assert {name.rsplit(".", maxsplit=name.count(".") - 1)[0] for name in new} == {
@@ -120,7 +125,7 @@ def test_exactly_the_adapters_and_the_new_modules_are_trained_and_saved(place):
 
 
 def test_frozen_weights_are_those_of_the_file_to_the_bit(place):
-    task = load_stage_one(config_of(place), place / "run", CPU)
+    task = loaded(place, place / "run")
     state = {name.replace(".base_layer", ""): tensor for name, tensor in task.module.state_dict().items()}
     for name, tensor in load_file(place / "trellis.safetensors").items():
         if name.startswith("flow.geometry."):
@@ -170,8 +175,8 @@ def test_merged_weights_are_the_same_function_without_adapters(place, tmp_path, 
     status, output = forehoi("weights", "merge", run, "--out", out)
     assert status == 0, output
     assert "latent_scale: 1.0" in output
-    before = predicted_masks(load_stage_one(config_of(place), run, CPU), images)
-    small = predicted_masks(load_stage_one(config_of(place), place / "run", CPU), images)
+    before = predicted_masks(loaded(place, run), images)
+    small = predicted_masks(loaded(place, place / "run"), images)
     assert not torch.allclose(before, small, atol=1e-3)
     merged = load_file(out)
     assert not any("lora" in name for name in merged)
@@ -184,14 +189,14 @@ def test_merged_weights_are_the_same_function_without_adapters(place, tmp_path, 
     shutil.copytree(run / "hand_encoder", tmp_path / "again" / "hand_encoder")
     status, output = forehoi("train", "stage_one", "--config", config, "--out", tmp_path / "again")
     assert status == 0, output
-    after = predicted_masks(load_stage_one(load_config(config), tmp_path / "again", CPU), images)
+    after = predicted_masks(stage_one(load_config(config)).flow.load(tmp_path / "again", CPU), images)
     torch.testing.assert_close(after, before, rtol=1e-3, atol=1e-4)
 
 
 def test_an_exported_adapter_is_that_of_the_averages_and_peft_reads_it(place, tmp_path):
     status, output = forehoi("weights", "export-adapter", place / "run", "--out", tmp_path / "adapter")
     assert status == 0, output
-    task = load_stage_one(config_of(place), place / "run", CPU)
+    task = loaded(place, place / "run")
     plain = GeometryBranch(config_of(place).stage_one.network.geometry)
     import_adapter(plain, tmp_path / "adapter")
     expected = dict(task.network.flow.geometry.named_parameters())

@@ -9,13 +9,14 @@ import yaml
 from safetensors.torch import load_file, save_file
 
 from model.networks.lora import import_adapter
-from model.recipes.config import read_settings
-from model.recipes.slat_components import load_slat_flow
-from model.recipes.slat_config import ImportedSlatVae, SlatTrainingConfig, load_any_config
+from model.recipes.components.slat_vae_component import ImportedSlatVae
+from model.recipes.config import load_config, read_settings
+from model.recipes.stage_two_config import StageTwoTrainingConfig
 from model.structured_latent.flow import SlatFlow
 from model.structured_latent.flow_training import SlatFlowTask
 from model.weights.weight_file import write_weight_file
 from tests.model.small_run import fails, forehoi, write_config
+from tests.model.stages import stage_two
 from tests.model.structured_latent.object_features.textured_ball import write_textured_balls
 from tests.model.weights.published_slat import write_published
 
@@ -28,7 +29,7 @@ def small_paper(root: Path) -> dict:
     """The preset paper_slat with small networks, the open encoders, and the balls."""
     settings = read_settings("paper_slat").data
     settings["data"] |= {"datasets": [str(root / "balls")], "workers": 0, "samples_per_motion": 2}
-    settings["data"] |= {"on_corrupt": "raise", "cameras": "train", "held_out_cameras": 0.4}
+    settings["data"] |= {"max_corrupt": 0, "held_out_cameras": 0.4}
     settings["validation"] |= {"split": "train", "views": 1, "batch_size": 1, "batches": 1}
     settings["encoders"] |= {"image": {"image_size": 64, "grid": 8}, "hand": {"packaged_grid": 8}}
     settings["meshes"]["samples"] = 500
@@ -66,14 +67,12 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def config_of(root: Path) -> SlatTrainingConfig:
-    config = load_any_config(root / "config.yaml")
-    assert isinstance(config, SlatTrainingConfig)
-    return config
+def config_of(root: Path) -> StageTwoTrainingConfig:
+    return stage_two(load_config(root / "config.yaml"))
 
 
 def loaded(root: Path, run: Path) -> SlatFlowTask:
-    return load_slat_flow(config_of(root), run, CPU)
+    return config_of(root).flow.load(run, CPU)
 
 
 def test_only_the_flow_is_trained(place: Path) -> None:

@@ -6,11 +6,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
-from model.recipes.components import load_stage_one
 from model.recipes.config import load_config
 from tests.model.data.balls import write_balls
 from tests.model.small_run import fails, forehoi, small_settings, write_config
+from tests.model.stages import stage_one
 
 
 @pytest.fixture(scope="module")
@@ -49,19 +50,31 @@ def test_a_run_goes_on_with_data_that_were_moved(root, elsewhere, tmp_path):
     assert json.loads((run / "stage_one" / "metrics.json").read_text()) == before
 
 
-@pytest.mark.parametrize("part", ["vae", "stage_one"])
-def test_other_data_are_refused(elsewhere, tmp_path, part):
-    """Of the part itself, and of one that it stands on."""
+def test_a_run_that_was_stopped_before_its_first_checkpoint_ends_as_one_in_one_go(root, tmp_path):
+    """It left nothing but what it measured of the data."""
+    run = Path(shutil.copytree(root / "run", tmp_path / "run"))
+    shutil.rmtree(run / "stage_one" / "checkpoints")
+    status, output = forehoi("train", root / "small.yaml", "--out", run)
+    assert status == 0, output
+    newest = Path("stage_one") / "checkpoints" / "step-00000002" / "weights.safetensors"
+    again, before = load_file(run / newest), load_file(root / "run" / newest)
+    assert again.keys() == before.keys()
+    assert all(torch.equal(again[name], before[name]) for name in before)
+
+
+@pytest.mark.parametrize("component", ["vae", "stage_one"])
+def test_other_data_are_refused(elsewhere, tmp_path, component):
+    """Of the component itself, and of one that it stands on."""
     run, config = elsewhere
     write_balls(tmp_path / "there", n_frames=4)
     shutil.rmtree(run / "stage_one")
-    line = fails("train", part, "--config", config, "--out", run)
+    line = fails("train", component, "--config", config, "--out", run)
     assert "vae/checkpoints/step-00000002: was trained on other data" in line
 
 
 def test_a_run_is_used_where_its_data_are_not(elsewhere, tmp_path):
     run, config = elsewhere
-    task = load_stage_one(load_config(config), run, torch.device("cpu"))
+    task = stage_one(load_config(config)).flow.load(run, torch.device("cpu"))
     found = task.predict(torch.rand(1, 2, 3, 64, 64), torch.Generator().manual_seed(0))
     assert found.occupancy.shape == (1, 64, 64, 64)
     assert not (tmp_path / "there").exists()

@@ -10,14 +10,16 @@ import yaml
 from accelerate import Accelerator
 
 from model.data.stream import ShardStream
-from model.recipes.components import load_stage_one, train_part, trained_parts
-from model.recipes.config import TrainingConfig, parse_config, read_settings
+from model.recipes.config import parse_config, read_settings
+from model.recipes.stage_one_config import StageOneTrainingConfig
+from model.recipes.train_component import train_component
 from shards.geometry import intrinsics_from_fov
 from shards.schema import FrameRow
 from shards.storage.images import MASK_BITS, decode_masks, encode_masks, encode_rgb_png, mask_box_px
 from shards.writer import begin_dataset, commit_shard, stage_motion
 from tests.model.data.balls import uid_of_split
 from tests.model.data.voxel_scene import lopsided_occupancy, render_mask
+from tests.model.stages import stage_one
 from tests.shards.synthetic import (
     PROVENANCE,
     dataset_record,
@@ -86,8 +88,8 @@ def _with_object(frame: FrameRow, amodal: np.ndarray) -> FrameRow:
     )
 
 
-def memorising_config(dataset: Path) -> TrainingConfig:
-    """The preset tiny on fixed crops, all of them in every sample, with masks of a cell per pixel."""
+def memorising_config(dataset: Path) -> StageOneTrainingConfig:
+    """configs/model/tiny.yaml on fixed crops, all of them in every sample, with masks of a cell per pixel."""
     settings = read_settings("tiny").data
     settings["data"] |= {
         "datasets": [str(dataset)],
@@ -97,36 +99,36 @@ def memorising_config(dataset: Path) -> TrainingConfig:
     }
     settings["validation"] |= {"views": FRAMES, "batch_size": 1, "samples_per_motion": 1, "batches": 1}
     settings["encoders"]["cached_views"] = CAMERAS * FRAMES
-    stage_one = settings["stage_one"]
-    stage_one["network"]["masks"] |= {"patch": 8}  # 16 tokens x 8 = the 128 px of the crops
-    stage_one["drop_condition"] = 0.0  # for guidance, which is off
-    parts = {
+    flow = settings["stage_one"]
+    flow["network"]["masks"] |= {"patch": 8}  # 16 tokens x 8 = the 128 px of the crops
+    flow["drop_condition"] = 0.0  # for guidance, which is off
+    sections = {
         "vae": (settings["vae"], {"batch_size": 1}, VAE_STEPS),
-        "stage_one": (stage_one, {"batch_size": 2, "views": [TRAINED_VIEWS] * 2}, STEPS),
+        "stage_one": (flow, {"batch_size": 2, "views": [TRAINED_VIEWS] * 2}, STEPS),
     }
-    for part, sizes, steps in parts.values():
-        part["recipe"] |= sizes
-        part["recipe"]["trainer"] |= {"steps": steps, "checkpoint_every": steps, "validate_every": steps}
+    for section, sizes, steps in sections.values():
+        section["recipe"] |= sizes
+        section["recipe"]["trainer"] |= {"steps": steps, "checkpoint_every": steps, "validate_every": steps}
     # At the rate of tiny.yaml a limb of the object can be lost for good: Dice has no gradient where it is sure.
     settings["vae"]["recipe"]["optimizer"]["learning_rate"] = 1e-3
-    return parse_config(yaml.safe_dump(settings), where="overfit")
+    return stage_one(parse_config(yaml.safe_dump(settings), where="overfit"))
 
 
 @pytest.mark.slow
 def test_one_motion_is_learned_by_heart(tmp_path):
     config = memorising_config(write_motion(tmp_path / "data"))
     accelerator = Accelerator(cpu=True)
-    for name in trained_parts(config):
-        train_part(name, config, tmp_path / "run", accelerator=accelerator, report=lambda _: None)
-    task = load_stage_one(config, tmp_path / "run", torch.device("cpu"))
+    for component in config.components():
+        train_component(component, config, tmp_path / "run", accelerator=accelerator, report=lambda _: None)
+    task = config.flow.load(tmp_path / "run", torch.device("cpu"))
     trained = replace(
-        config.data,
+        config.stage_one.recipe.stream(config.data, surface=False),
         views=(TRAINED_VIEWS, TRAINED_VIEWS),
         batch_size=1,
         endless=False,
         samples_per_motion=4,  # the same views, other noise
     )
-    metrics = task.evaluate(ShardStream(trained)).metrics
+    metrics = task.measure(ShardStream(trained)).evaluation().metrics
     assert metrics["visible_iou"] < 0.9  # else there would be nothing to complete
     assert metrics["voxel_iou"] > 0.95
     assert metrics["mask_iou"] > 0.98

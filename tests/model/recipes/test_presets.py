@@ -5,11 +5,11 @@ from dataclasses import replace
 from textwrap import dedent
 
 import pytest
+from model.recipes.slat_config import load_any_config
 
 from model.encoders.dino import DinoConfig
 from model.flow import UniformTime
 from model.recipes.config import PRESETS, TrainingConfig, load_config
-from model.recipes.slat_config import load_any_config
 from shards.configuration.presets import preset_names
 from tests.model.small_run import ROOT, fails, forehoi
 

@@ -1,4 +1,4 @@
-"""Stage 2 trained on image features of the clean objects, with the open image encoder: both parts, end to end."""
+"""Stage 2 trained on image features of the clean objects, with the open image encoder: both components, end to end."""
 
 import math
 from pathlib import Path
@@ -8,15 +8,16 @@ import torch
 import yaml
 from accelerate import Accelerator
 
-from model.recipes.config import read_settings
-from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, train_slat_part
-from model.recipes.slat_config import SlatTrainingConfig, parse_any_config
+from model.recipes.config import parse_config, read_settings
+from model.recipes.stage_two_config import StageTwoTrainingConfig
+from model.recipes.train_component import train_component
+from tests.model.stages import stage_two
 from tests.model.structured_latent.object_features.textured_ball import write_textured_balls
 
 STEPS = {"slat_vae": 24, "slat_flow": 3}
 
 
-def small_config(dataset: Path, cache: Path | None) -> SlatTrainingConfig:
+def small_config(dataset: Path, cache: Path | None) -> StageTwoTrainingConfig:
     """tiny_slat.yaml with features of views, cut down to seconds; flips are on."""
     settings = read_settings("tiny_slat").data
     settings["data"] |= {"datasets": [str(dataset)], "workers": 0, "held_out_cameras": 0.4}
@@ -33,23 +34,22 @@ def small_config(dataset: Path, cache: Path | None) -> SlatTrainingConfig:
     }
     flow = {"channels": 12, "heads": 1, "blocks": 1, "io_channels": [4, 8], "condition_channels": 12}
     settings["slat_flow"]["network"] |= flow
-    for part in SLAT_PARTS:
-        recipe = settings[part]["recipe"]
-        recipe |= {"batch_size": 1, "views": [1, 1], "image_size": 32}
-        steps = STEPS[part]
+    settings["slat_flow"]["recipe"] |= {"views": [1, 1], "image_size": 32}
+    for component, steps in STEPS.items():
+        recipe = settings[component]["recipe"]
+        recipe["batch_size"] = 1
         recipe["trainer"] |= {"steps": steps, "checkpoint_every": steps, "validate_every": steps}
         recipe["trainer"]["log_every"] = 1
         recipe["optimizer"]["warmup_steps"] = 2
-    config = parse_any_config(yaml.safe_dump(settings), where="small")
-    assert isinstance(config, SlatTrainingConfig)
-    return config
+    return stage_two(parse_config(yaml.safe_dump(settings), where="small"))
 
 
-def trained(name: str, config: SlatTrainingConfig, folder: Path) -> list[float]:
+def trained(name: str, config: StageTwoTrainingConfig, folder: Path) -> list[float]:
     """Losses of its steps."""
     losses: list[float] = []
-    train_slat_part(
-        name,
+    (component,) = (component for component in config.components() if component.name == name)
+    train_component(
+        component,
         config,
         folder,
         accelerator=Accelerator(cpu=True),
@@ -74,7 +74,7 @@ def test_the_vae_learns_and_the_flow_trains_on_it(place: Path) -> None:
     # Where the features are kept decides nothing: a finished run is found without its cache, and needs no views.
     elsewhere = small_config(place / "balls", None)
     assert trained("slat_vae", elsewhere, place / "run") == []
-    task = load_slat_flow(elsewhere, place / "run", torch.device("cpu"))
+    task = elsewhere.flow.load(place / "run", torch.device("cpu"))
     occupancy = torch.zeros(1, 64, 64, 64, dtype=torch.bool)
     occupancy[0, 20:24, 20:24, 20:24] = True
     prediction = task.predict(torch.rand(1, 2, 3, 32, 32), occupancy, torch.Generator().manual_seed(0))

@@ -121,19 +121,19 @@ def test_prediction_is_repeatable_and_has_the_sizes_of_its_inputs(task, batch):
 
 
 def test_evaluation_scores_the_visible_mask_as_it_is(task, batch):
-    evaluation = task.evaluate([batch])
+    evaluation = task.measure([batch]).evaluation()
     assert tuple(evaluation.metrics) == METRICS
     assert evaluation.metrics["visible_iou"] == pytest.approx(0.5)
     assert evaluation.metrics["occluded_visible_iou"] == pytest.approx(0.5)
     assert evaluation.metrics["occluded_mask_iou"] == evaluation.metrics["mask_iou"]
     batch.object_visible[:] = batch.object_amodal
-    assert math.isnan(task.evaluate([batch]).metrics["occluded_mask_iou"])
+    assert math.isnan(task.measure([batch]).evaluation().metrics["occluded_mask_iou"])
     assert 0.0 <= evaluation.metrics["mask_iou"] <= 1.0
     assert evaluation.images["prediction"].shape == (3 * 128, (2 * 4 + 2) * 128, 3)
 
 
 def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(task, batch):
-    assert math.isnan(task.evaluate([batch]).metrics["found_visible_iou"])  # no network of ours
+    assert math.isnan(task.measure([batch]).evaluation().metrics["found_visible_iou"])  # no network of ours
     network = HandNet(HandNetConfig(image_size=32, stem=(8, 8), decoder=8)).eval()
     encoder = HandEncoder(network=network, grid=2)
     sizes = replace(task.network.aggregator.config, hand_channels=encoder.channels)
@@ -146,7 +146,7 @@ def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(tas
         with torch.no_grad():  # the object everywhere, then nowhere
             network.maps.weight[1] = 0.0
             network.maps.bias[1] = bias
-        metrics = looking.evaluate([batch]).metrics
+        metrics = looking.measure([batch]).evaluation().metrics
         assert metrics["found_visible_iou"] == pytest.approx(expected)
         assert metrics["occluded_found_visible_iou"] == pytest.approx(expected)
 
@@ -156,9 +156,9 @@ def test_an_empty_prediction_is_counted_and_its_distance_is_finite(task, batch):
     with torch.no_grad():
         bias = task.vae.decoder.out_layer[2].bias
         bias += 100 - bias.min()
-        full = task.evaluate([batch]).metrics
+        full = task.measure([batch]).evaluation().metrics
         bias -= 1000
-        metrics = task.evaluate([batch]).metrics
+        metrics = task.measure([batch]).evaluation().metrics
     assert (full["empty"], metrics["empty"]) == (0.0, 1.0)
     assert full["chamfer"] < metrics["chamfer"] == pytest.approx(math.sqrt(3))
     assert metrics["voxel_iou"] == 0.0
@@ -171,7 +171,10 @@ def test_what_is_measured_on_a_batch_does_not_depend_on_the_batches_before_it(ta
     apart = [task.measure([part]).numbers for part in (second, first)]
     assert together == {name: apart[1][name] + apart[0][name] for name in METRICS}
     assert together["chamfer"][0] != together["chamfer"][1]
-    assert task.evaluate([second, first]).metrics == task.evaluate([first, second]).metrics
+    assert (
+        task.measure([second, first]).evaluation().metrics
+        == task.measure([first, second]).evaluation().metrics
+    )
 
 
 def test_mask_targets_are_plus_one_where_more_than_half_is_covered(batch):

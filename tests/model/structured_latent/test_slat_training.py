@@ -1,19 +1,24 @@
 """The stage-2 tasks on small networks: losses fall, samples are independent, predictions repeat, tables are honest."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from model.data.batch import Batch
+from model.data.batch import Batch, SurfaceTarget
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
 from model.flow import Guidance, SamplerSettings, UniformTime
 from model.networks.sparse.tensor import SparseTensor
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
 from model.structured_latent.flow_training import LATENT, SlatFlowTask, SlatFlowTraining
-from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, mean_scores, scored_mesh
+from model.structured_latent.mesh_evaluation import (
+    MeshEvaluationConfig,
+    numbers_of_objects,
+    scored_mesh,
+)
 from model.structured_latent.object_features.object_input import ObjectInputs, object_surface
 from model.structured_latent.object_features.surface_features import FEATURE_CHANNELS
 from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
@@ -23,7 +28,7 @@ from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.surface.extraction import ExtractionConfig
 from model.surface.fields import CHANNELS, CORNERS
 from model.training.step_generators import sample_generators
-from model.training.task import Task
+from model.training.task import Measurements, Task, merged
 from tests.model.encoders.mean_color import MeanColor
 from tests.model.structured_latent.watertight_shapes import (
     ball,
@@ -124,7 +129,7 @@ def test_the_vae_learns_two_objects(vae_task, batch):
         optimizer.step()
         optimizer.zero_grad()
     assert float(losses.total.detach()) < 0.35 * first
-    metrics = vae_task.evaluate([batch]).metrics
+    metrics = vae_task.measure([batch]).evaluation().metrics
     assert metrics["f_5mm"] > 99
     assert metrics["manifold"] == 100
     assert metrics["normal_deg"] < 20
@@ -182,19 +187,42 @@ def test_true_latents_come_back_through_normalisation(flow_task, batch):
 
 
 def test_the_table_shows_what_is_learned(flow_task, batch):
-    evaluation = flow_task.evaluate([batch])
+    evaluation = flow_task.measure([batch]).evaluation()
     for name in ("f_5mm", "mean_latent_f_5mm", "true_latent_f_5mm", "latent_error"):
         assert name in evaluation.metrics
     image = next(iter(evaluation.images.values()))
     assert image.shape == (2 * 192, 4 * 192, 3)
 
 
+def means_of(decoded: SparseTensor, truth: SurfaceTarget) -> dict[str, float]:
+    """Metrics of the mesh of one object."""
+    numbers = numbers_of_objects({"object": scored_mesh(decoded, 0, truth, MESHES)})
+    return Measurements(numbers={}, of_objects=numbers, images={}).evaluation().metrics
+
+
+@pytest.mark.parametrize("kind", ["vae_task", "flow_task"])
+def test_ranks_that_share_batches_find_what_one_finds(kind, batch, request):
+    """And count an object once where two of them have seen it."""
+    task: Task = request.getfixturevalue(kind)
+    ball, plate = batch.part(0, 1), batch.part(1, 2)
+    batches = [replace(b, ids=(f"{number}",)) for number, b in enumerate((ball, plate, ball, plate, plate))]
+    alone = task.measure(batches)
+    shares = [task.measure(batches[rank::2]) for rank in range(2)]
+    assert set(shares[0].of_objects["{}chamfer_cm".format("" if kind == "vae_task" else "true_latent_")]) == {
+        "0",
+        "1",
+    }
+    together, expected = merged(shares).evaluation().metrics, alone.evaluation().metrics
+    assert together == pytest.approx(expected, rel=1e-9, nan_ok=True)
+    assert list(together) == list(expected)
+
+
 def test_an_object_without_a_mesh_is_counted(flow_task, batch):
     decoded = flow_task.decoded(flow_task.clean_latent(batch)).decoded
     outside = decoded.with_features(torch.full_like(decoded.features, 3.0))
     truth = object_surface(batch.true_surface, 0)
-    metrics = mean_scores([scored_mesh(outside, 0, truth, MESHES)])
-    assert metrics["without_mesh"] == 1
+    metrics = means_of(outside, truth)
+    assert metrics["without_mesh"] == 100
     assert metrics["f_10mm"] == 0
     assert metrics["chamfer_cm"] == pytest.approx(200 * math.sqrt(3) * truth.object_scale_m)
     assert math.isnan(metrics["normal_deg"])  # not 0, which would be perfect
@@ -213,7 +241,7 @@ def test_a_pierced_surface_shows_in_its_handles(batch):
 
     def metrics(channels: torch.Tensor) -> dict[str, float]:
         decoded = SparseTensor.from_samples([channels], [voxels], 64)
-        return mean_scores([scored_mesh(decoded, 0, truth, MESHES)])
+        return means_of(decoded, truth)
 
     clean = metrics(channels)
     assert (clean["handles"], clean["components"], clean["manifold"]) == (0, 1, 100)

@@ -189,8 +189,9 @@ def test_sigterm_saves_and_the_next_run_goes_on(tmp_path):
     assert_same_tensors(tmp_path / "whole", tmp_path / "killed")
 
 
-def test_nan_stops_with_the_samples_named_and_the_last_good_state_kept(tmp_path):
-    with pytest.raises(NonFiniteLossError, match=r"the loss is nan .*samples .*toy:2:29.*newest checkpoint"):
+def test_nan_stops_with_motions_clips_and_frames_named_and_the_last_good_state_kept(tmp_path):
+    named = r"toy:2:29 \(clip-29 frame 0, clip-29 frame 7\)"
+    with pytest.raises(NonFiniteLossError, match=rf"the loss is nan .*samples .*{named}.*newest checkpoint"):
         run(tmp_path, settings(20), source=ToySource(4, poison=29))
     state = read_state(latest_checkpoint(tmp_path / "checkpoints"))
     assert state.step == 4
@@ -212,7 +213,9 @@ class _GradientOverflows(ToyTask):
 
 
 def test_a_gradient_that_is_not_finite_stops_before_it_reaches_the_weights(tmp_path):
-    with pytest.raises(NonFiniteLossError, match=r"step 5: the gradient is nan .*toy:1:.*newest checkpoint"):
+    with pytest.raises(
+        NonFiniteLossError, match=r"step 5: the gradient is nan .*toy:1:\d+ \(clip-.*newest checkpoint"
+    ):
         train(
             _GradientOverflows(),
             ToySource(4),
@@ -232,7 +235,7 @@ def test_validation_uses_the_averaged_weights_and_takes_them_back(tmp_path):
 
     def validate():
         seen.append({name: p.detach().clone() for name, p in task.module.named_parameters()})
-        return task.evaluate([next(ToySource(2).batches(0, 0)).batch])
+        return task.measure([next(ToySource(2).batches(0, 0)).batch]).evaluation()
 
     train(
         task,

@@ -16,7 +16,7 @@ from torch import nn
 from model.data.batch import Batch
 from model.training.config import OptimizerConfig, TrainerConfig
 from model.training.step_generators import normal_like
-from model.training.task import Evaluation, Losses
+from model.training.task import Losses, Measurements
 from model.training.trainer import PlacedBatch, StepReport, train
 
 EPOCH = 12  # samples
@@ -85,7 +85,13 @@ class ToySource:
             samples_consumed += self.global_batch
             stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
             yield PlacedBatch(
-                batch=Batch(**stacked, ids=tuple(f"toy:{epoch}:{position}" for position in positions)),
+                batch=Batch(
+                    **stacked,
+                    ids=tuple(f"toy:{epoch}:{position}" for position in positions),
+                    views=tuple(
+                        (f"clip-{position} frame 0", f"clip-{position} frame 7") for position in positions
+                    ),
+                ),
                 places=list(places),
                 epoch=epoch,
                 samples_consumed=samples_consumed,
@@ -109,10 +115,10 @@ class ToyTask:
         error = (predicted - batch.images.mean(dim=(1, 3, 4))).square().mean()
         return Losses(total=error, parts={"color": error})
 
-    def evaluate(self, batches: Iterable[Batch]) -> Evaluation:
+    def measure(self, batches: Iterable[Batch]) -> Measurements:
         errors = [self.loss(batch, [torch.Generator() for _ in batch.ids]).total for batch in batches]
-        return Evaluation(
-            metrics={"error": float(torch.stack(errors).mean())},
+        return Measurements(
+            numbers={"error": [float(error) for error in errors]},
             images={"grey": np.zeros((4, 4, 3), np.uint8)},
         )
 

@@ -13,7 +13,8 @@ from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
 from model.networks.lora import add_lora, trainable_parameters
 from model.networks.sparse.tensor import SparseTensor
-from model.recipes.slat_config import SlatTrainingConfig, load_any_config
+from model.recipes.config import load_config
+from model.recipes.stage_two_config import StageTwoTrainingConfig
 from model.structured_latent.flow import SlatFlow
 from model.structured_latent.vae.decoder import SurfaceDecoder
 from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
@@ -30,6 +31,7 @@ from model.weights.slat import (
     trellis_normalisation,
 )
 from model.weights.weight_file import load_weights
+from tests.model.stages import stage_two
 from tests.model.structured_latent.small_slat import PAPER_FLOW
 from tests.model.weights import published_slat
 from tests.model.weights.published import refused
@@ -55,11 +57,9 @@ SMALL_VAE = SlatVaeConfig(
 
 
 @pytest.fixture(scope="module")
-def paper() -> SlatTrainingConfig:
-    """The preset paper_slat."""
-    config = load_any_config("paper_slat")
-    assert isinstance(config, SlatTrainingConfig)
-    return config
+def paper() -> StageTwoTrainingConfig:
+    """configs/model/paper_slat.yaml."""
+    return stage_two(load_config("paper_slat"))
 
 
 def write_published(folder: Path) -> dict[str, dict[str, Tensor]]:
@@ -74,7 +74,7 @@ def fails(source: Path, out: Path, *parts: str) -> None:
     refused(lambda: run(source, out), out, *parts)
 
 
-def test_the_paper_configuration_has_the_published_names_and_shapes(paper: SlatTrainingConfig) -> None:
+def test_the_paper_configuration_has_the_published_names_and_shapes(paper: StageTwoTrainingConfig) -> None:
     flow, vae = paper.slat_flow.network, paper.slat_vae.network
     assert flow == PAPER_FLOW
     with torch.device("meta"):
@@ -86,7 +86,7 @@ def test_the_paper_configuration_has_the_published_names_and_shapes(paper: SlatT
 
 
 def test_adapters_of_the_paper_configuration_are_on_every_attention_projection(
-    paper: SlatTrainingConfig,
+    paper: StageTwoTrainingConfig,
 ) -> None:
     assert paper.slat_flow.lora is not None
     with torch.device("meta"):
@@ -103,7 +103,7 @@ def test_adapters_of_the_paper_configuration_are_on_every_attention_projection(
 
 
 @pytest.mark.skipif(not RESEARCH.exists(), reason="the research notes are not part of the repository")
-def test_manifest_and_sizes_repeat_the_research_notes(paper: SlatTrainingConfig) -> None:
+def test_manifest_and_sizes_repeat_the_research_notes(paper: StageTwoTrainingConfig) -> None:
     research = json.loads(RESEARCH.read_text())
     for network in slat_networks(paper.slat_flow.network, paper.slat_vae.network):
         noted = research[network.name]

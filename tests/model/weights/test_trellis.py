@@ -13,6 +13,7 @@ from model.sparse_structure.dual_branch import DualBranchFlow
 from model.tensor_files.safetensors_file import shapes_of
 from model.weights.published import find_published, import_networks, published_shapes
 from model.weights.trellis import stage_one_networks
+from tests.model.stages import stage_one
 from tests.model.weights.published import (
     CLASSES,
     DECODER,
@@ -27,7 +28,7 @@ from tests.model.weights.published import (
 
 ROOT = Path(__file__).resolve().parents[3]
 RESEARCH = ROOT.parent / "shared/research/trellis_parameters.json"
-PAPER = load_config("paper")
+PAPER = stage_one(load_config("paper"))
 PREFIXES = {FLOW: "flow.geometry.", ENCODER: "vae.encoder.", DECODER: "vae.decoder."}
 
 

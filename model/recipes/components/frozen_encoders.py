@@ -1,16 +1,54 @@
 """The frozen encoders of images and hands that a configuration names, and the trained aggregator over them."""
 
+from dataclasses import dataclass
+
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.cached import CachedEncoder
 from model.encoders.dino import DinoConfig, load_dino
-from model.encoders.efficientnet import load_efficientnet
-from model.encoders.hand import HandEncoder, packaged_hand_net
+from model.encoders.efficientnet import EfficientNetConfig, load_efficientnet
+from model.encoders.hand import HandEncoder, packaged_hand_net, packaged_hand_sha256
 from model.encoders.protocol import FeatureEncoder
-from model.encoders.wilor import load_wilor
+from model.encoders.wilor import WilorConfig, load_wilor
 from model.errors import ModelError
-from model.recipes.config import EncodersConfig, OwnHandEncoder, PackagedHandEncoder
 
-__all__ = ["aggregator_over", "given_hand_encoder", "image_encoder", "with_cache"]
+__all__ = [
+    "EncodersConfig",
+    "OwnHandEncoder",
+    "PackagedHandEncoder",
+    "aggregator_over",
+    "encoder_digests",
+    "given_hand_encoder",
+    "image_encoder",
+    "with_cache",
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnHandEncoder:
+    """The hand encoder that this configuration trains, on a token grid of its own."""
+
+    own_grid: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class PackagedHandEncoder:
+    """The hand encoder that ships with the package, on a token grid of its own."""
+
+    packaged_grid: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class EncodersConfig:
+    """Frozen encoders of the images."""
+
+    image: EfficientNetConfig | DinoConfig
+    hand: OwnHandEncoder | PackagedHandEncoder | WilorConfig
+    cached_views: int  # images whose features are kept; of use where crops repeat, 0: none
+
+
+def encoder_digests(encoders: EncodersConfig) -> tuple[str, ...]:
+    """Digest of the packaged hand encoder, if it is used: it may change with the package."""
+    return (packaged_hand_sha256(),) if isinstance(encoders.hand, PackagedHandEncoder) else ()
 
 
 def image_encoder(config: EncodersConfig) -> FeatureEncoder:

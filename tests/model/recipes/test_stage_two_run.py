@@ -1,4 +1,4 @@
-"""Stage 2 by its configuration on a small dataset: both parts, exact resume, and what can go wrong."""
+"""Stage 2 by its configuration on a small dataset: both components, exact resume, and what can go wrong."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -12,9 +12,12 @@ from safetensors.torch import load_file
 from model.data.stream import ShardStream
 from model.errors import ModelError
 from model.networks.lora import LoraSettings
-from model.recipes.config import TrainingConfig, as_yaml, read_settings
-from model.recipes.slat_components import SLAT_PARTS, load_slat_flow, train_slat_part
-from model.recipes.slat_config import SlatTrainingConfig, load_any_config, parse_any_config
+from model.recipes.components.component import Component
+from model.recipes.components.component_identity import as_yaml
+from model.recipes.components.slat_vae_component import TrainedSlatVae
+from model.recipes.config import load_config, parse_config, read_settings
+from model.recipes.stage_two_config import StageTwoTrainingConfig
+from model.recipes.train_component import train_component
 from model.structured_latent.flow import SlatFlow
 from model.structured_latent.vae.latent import LatentNormalisation
 from model.training.checkpoint import latest_checkpoint
@@ -22,9 +25,10 @@ from model.weights.slat import SLAT_FLOW
 from model.weights.weight_file import write_weight_file
 from shards.settings import SettingsError
 from tests.model.data.balls import write_balls
+from tests.model.stages import stage_two
 
 FOLDER = Path(__file__).resolve().parents[3] / "configs" / "model"
-NAMES = sorted(path.stem for path in FOLDER.glob("*_slat.yaml"))
+COMPONENTS = ("slat_vae", "slat_flow")
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +37,7 @@ def dataset(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def config(dataset) -> SlatTrainingConfig:
+def config(dataset) -> StageTwoTrainingConfig:
     """tiny_slat.yaml, cut down to seconds."""
     settings = read_settings("tiny_slat").data
     settings["data"] |= {
@@ -54,17 +58,22 @@ def config(dataset) -> SlatTrainingConfig:
         "condition_channels": 12,
     }
     settings["slat_flow"]["sampler"]["steps"] = 2
-    for part in SLAT_PARTS:
-        recipe = settings[part]["recipe"]
-        recipe |= {"batch_size": 1, "views": [1, 2], "image_size": 32}
+    settings["slat_flow"]["recipe"] |= {"views": [1, 2], "image_size": 32}
+    for component in COMPONENTS:
+        recipe = settings[component]["recipe"]
+        recipe["batch_size"] = 1
         recipe["trainer"] |= {"steps": 2, "checkpoint_every": 1, "validate_every": 2, "log_every": 1}
-    return parse_any_config(yaml.safe_dump(settings), where="small")
+    return stage_two(parse_config(yaml.safe_dump(settings), where="small"))
 
 
-def train(name: str, config: SlatTrainingConfig, folder: Path) -> tuple[dict[str, float], list[int]]:
+def component_of(config: StageTwoTrainingConfig, name: str) -> Component:
+    return {component.name: component for component in config.components()}[name]
+
+
+def train(name: str, config: StageTwoTrainingConfig, folder: Path) -> tuple[dict[str, float], list[int]]:
     steps: list[int] = []
-    metrics = train_slat_part(
-        name,
+    metrics = train_component(
+        component_of(config, name),
         config,
         folder,
         accelerator=Accelerator(cpu=True),
@@ -75,9 +84,9 @@ def train(name: str, config: SlatTrainingConfig, folder: Path) -> tuple[dict[str
 
 @pytest.fixture(scope="module")
 def finished(config, tmp_path_factory) -> Path:
-    """The run of both parts. Do not change it."""
+    """The run of both components. Do not change it."""
     folder = tmp_path_factory.mktemp("run")
-    for name in SLAT_PARTS:
+    for name in COMPONENTS:
         metrics, steps = train(name, config, folder)
         assert steps == [1, 2]
         assert "f_5mm" in metrics
@@ -99,7 +108,7 @@ def test_a_finished_run_trains_nothing_and_gives_its_metrics(config, finished):
     assert all(torch.equal(before[name], after[name]) for name in before)
 
 
-@pytest.mark.parametrize("name", SLAT_PARTS)
+@pytest.mark.parametrize("name", COMPONENTS)
 def test_a_run_that_was_stopped_ends_where_one_without_a_stop_does(name, config, finished, tmp_path):
     (tmp_path / "slat_vae").symlink_to(finished / "slat_vae") if name == "slat_flow" else None
     _stop_after_one_step(name, config, tmp_path)
@@ -109,7 +118,7 @@ def test_a_run_that_was_stopped_ends_where_one_without_a_stop_does(name, config,
     assert all(torch.equal(ours[key], theirs[key]) for key in theirs)
 
 
-def _stop_after_one_step(name: str, config: SlatTrainingConfig, folder: Path) -> None:
+def _stop_after_one_step(name: str, config: StageTwoTrainingConfig, folder: Path) -> None:
     class StopError(Exception):
         pass
 
@@ -118,12 +127,14 @@ def _stop_after_one_step(name: str, config: SlatTrainingConfig, folder: Path) ->
             raise StopError
 
     with pytest.raises(StopError):
-        train_slat_part(name, config, folder, accelerator=Accelerator(cpu=True), report=stop)
+        train_component(
+            component_of(config, name), config, folder, accelerator=Accelerator(cpu=True), report=stop
+        )
 
 
 def test_the_trained_flow_predicts_from_images(config, finished):
-    task = load_slat_flow(config, finished, torch.device("cpu"))
-    stream = ShardStream(replace(config.data, views=(2, 2)))
+    task = config.flow.load(finished, torch.device("cpu"))
+    stream = ShardStream(replace(config.slat_flow.recipe.stream(config.data, surface=False), views=(2, 2)))
     batch = next(iter(stream))
     prediction = task.predict(batch.images, batch.occupancy, torch.Generator().manual_seed(0))
     assert prediction.fields(0).resolution == 64
@@ -137,13 +148,13 @@ def test_a_flow_with_adapters_is_used_with_the_weights_that_it_started_from(conf
     normalisation = LatentNormalisation.identity(config.slat_flow.network.latent_channels).state_dict()
     tensors |= {f"stage_two.normalisation.{name}": value for name, value in normalisation.items()}
     write_weight_file(start, tensors, sources={})
-    part = replace(config.slat_flow, start=start, lora=LoraSettings(rank=2, alpha=4, dropout=0.0))
-    adapted = replace(config, slat_flow=part)
+    section = replace(config.slat_flow, start=start, lora=LoraSettings(rank=2, alpha=4))
+    adapted = replace(config, slat_flow=section)
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "slat_vae").symlink_to(finished / "slat_vae")
     _, steps = train("slat_flow", adapted, tmp_path / "run")
     assert steps == [1, 2]
-    flow = load_slat_flow(adapted, tmp_path / "run", torch.device("cpu")).network.flow
+    flow = adapted.flow.load(tmp_path / "run", torch.device("cpu")).network.flow
     held = flow.state_dict()
     assert any("lora_A" in name for name in held)
     name = "blocks.0.mlp.mlp.0.weight"
@@ -156,7 +167,9 @@ def test_the_flow_without_its_vae_says_what_to_train(config, tmp_path):
 
 
 def test_the_vae_of_another_configuration_is_refused(config, finished):
-    other = replace(config, slat_vae=replace(config.slat_vae, loss=replace(config.slat_vae.loss, kl=0.5)))
+    section = config.slat_vae
+    assert isinstance(section, TrainedSlatVae)
+    other = replace(config, slat_vae=replace(section, loss=replace(section.loss, kl=0.5)))
     with pytest.raises(ModelError, match="another configuration"):
         train("slat_flow", other, finished)
 
@@ -164,30 +177,18 @@ def test_the_vae_of_another_configuration_is_refused(config, finished):
 def test_the_hand_encoder_of_stage_one_is_refused(config, finished):
     text = as_yaml(config).replace("packaged_grid", "own_grid")
     with pytest.raises(ModelError, match="packaged_grid"):
-        load_slat_flow(parse_any_config(text, where="own"), finished, torch.device("cpu"))
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_published_configurations_are_complete(name):
-    config = load_any_config(FOLDER / f"{name}.yaml")
-    assert isinstance(config, SlatTrainingConfig)
-    assert config.name == name
-    assert parse_any_config(as_yaml(config), where="again") == config
-
-
-def test_files_of_stage_one_are_read_as_such():
-    assert isinstance(load_any_config(FOLDER / "tiny.yaml"), TrainingConfig)
+        stage_two(parse_config(text, where="own")).flow.load(finished, torch.device("cpu"))
 
 
 def test_contradictions_name_both_sides(config):
     text = as_yaml(config)
     with pytest.raises(SettingsError, match="feature_channels is 10"):
-        parse_any_config(text.replace("feature_channels: 16", "feature_channels: 10"), where="file")
+        parse_config(text.replace("feature_channels: 16", "feature_channels: 10"), where="file")
     bad = yaml.safe_load(text)
     bad["slat_flow"]["network"]["latent_channels"] = 4
     with pytest.raises(SettingsError, match="takes 4 channels"):
-        parse_any_config(yaml.safe_dump(bad), where="file")
+        parse_config(yaml.safe_dump(bad), where="file")
     with pytest.raises(SettingsError, match="slat_flo"):
-        parse_any_config(text.replace("slat_flow:", "slat_flo:"), where="file")
-    with pytest.raises(SettingsError, match="no such configuration"):
-        load_any_config(FOLDER / "nothing.yaml")
+        parse_config(text.replace("slat_flow:", "slat_flo:"), where="file")
+    with pytest.raises(ModelError, match="does not exist"):
+        load_config(FOLDER / "nothing.yaml")

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from model.errors import ModelError
 from model.tensor_files.safetensors_file import write_tensors
+from model.training.checkpoint import latest_checkpoint
 
 __all__ = ["DatasetStatistics", "load_statistics", "statistics_of_run"]
 
@@ -27,8 +28,13 @@ class DatasetStatistics:
 
 
 def statistics_of_run(folder: Path, measure: Callable[[], DatasetStatistics]) -> DatasetStatistics:
-    """Those of a run that goes on, or of one that begins: measured and written."""
-    if (folder / _FILE).exists():
+    """Those of a run that resumes, or of one that begins: measured and written.
+
+    They belong to the first checkpoint, which is of one configuration and of one content of the data. Before there is
+    one, what a stopped run left may be of others, and measuring also draws from torch's global generator, as in a run
+    that was never stopped.
+    """
+    if latest_checkpoint(folder / "checkpoints") is not None and (folder / _FILE).exists():
         return load_statistics(folder)
     statistics = measure()
     scale = torch.tensor(statistics.latent_scale, dtype=torch.float64)

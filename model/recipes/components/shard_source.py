@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from model.data.index import MotionIndex
 from model.data.stream import ShardStream, StreamConfig, StreamState
-from model.recipes.component_identity import sha256_of
+from model.recipes.components.component_identity import sha256_of
 from model.training.trainer import PlacedBatch
 
 __all__ = ["StreamSource"]
