@@ -1,4 +1,4 @@
-"""reconstruct: images of a hand that holds an object to amodal masks, voxels and a closed coloured mesh."""
+"""reconstruct: images of a hand that holds an object to amodal masks, voxels and a watertight coloured mesh."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -102,7 +102,7 @@ def reconstruct(
         frames = frames.select(choice.positions)
     crops = first_crops(frames, boxes_px)
     if settings.closer_crop is not None:
-        with clock.stage("find hand and object"):
+        with clock.stage("detect hand and object"):
             crops = _closer_crops(frames, crops, networks, settings.seed, settings.closer_crop)
     with clock.stage("stage 1: masks and voxels"):
         one = run_stage_one(frames, crops, networks, settings.seed)

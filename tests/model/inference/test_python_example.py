@@ -22,6 +22,6 @@ def test_a_clip_becomes_a_watertight_mesh(runs, tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert "faces, watertight" in done.stdout
-    mesh = trimesh.load(tmp_path / "object.glb", force="mesh")
+    mesh = trimesh.load_mesh(tmp_path / "object.glb")
     assert mesh.is_watertight
     assert abs(mesh.bounds).max() <= 0.51

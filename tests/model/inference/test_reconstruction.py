@@ -51,7 +51,7 @@ def test_the_surface_is_a_watertight_and_every_stage_is_timed(result, networks):
     assert result.masks.min() >= 0
     assert result.masks.max() <= 1
     assert [name.partition(":")[0] for name in result.seconds] == [
-        "find hand and object",
+        "detect hand and object",
         "stage 1",
         "stage 2",
         "mesh",
