@@ -122,7 +122,8 @@ def rows_from_table(table: pa.Table, row_type: type[Row], *, where: str) -> list
 def column_values(chunked: pa.ChunkedArray, c: Column) -> list[Any] | np.ndarray:
     """Python values of a scalar column; one array (row, *shape), or a list of arrays when lengths vary."""
     if not c.shape:
-        return chunked.to_pylist()
+        scalars: list[Any] = chunked.to_pylist()
+        return scalars
     array = chunked.combine_chunks()
     lengths = None
     if isinstance(c.shape[0], str):
@@ -130,7 +131,7 @@ def column_values(chunked: pa.ChunkedArray, c: Column) -> list[Any] | np.ndarray
     flat = array.flatten()
     for _ in c.shape[1:]:
         flat = flat.flatten()
-    values = flat.to_numpy(zero_copy_only=False)
+    values: np.ndarray = flat.to_numpy(zero_copy_only=False)
     if lengths is None:
         return values.reshape(len(array), *c.shape)
     items = values.reshape(int(lengths.sum()), *c.shape[1:])

@@ -4,12 +4,12 @@ Everything is verified on the way: each JSON record by its own hash, each Parque
 hash and each column chunk by the CRC in shard.json. Damage raises a ShardError, never wrong data.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import fsspec
 import numpy as np
@@ -41,6 +41,8 @@ __all__ = [
     "open_shard",
     "open_shards",
 ]
+
+_Image = TypeVar("_Image")  # RGB, masks or geometry of one frame
 
 
 class ColumnTable:
@@ -105,7 +107,7 @@ class Frames(ColumnTable):
         (row,) = rows_from_table(self.arrow.slice(index, 1), FrameRow, where=self.where)
         return Frame(row=row, rgb=self.rgb(index), masks=self.masks(index), geometry=self.geometry(index))
 
-    def _decoded(self, column: str, index: int, decode: Any) -> Any:
+    def _decoded(self, column: str, index: int, decode: Callable[[bytes], _Image]) -> _Image:
         if column not in self.arrow.column_names:
             self[column]  # raises
         try:
@@ -314,7 +316,7 @@ def _shard(fs: fsspec.AbstractFileSystem, path: str) -> Shard:
 
 def _read(fs: fsspec.AbstractFileSystem, path: str) -> bytes:
     try:
-        return fs.cat_file(path)
+        return bytes(fs.cat_file(path))
     except (FileNotFoundError, NotADirectoryError) as error:
         fix = "check the address; a shard without its shard.json is unfinished"
         raise DatasetNotFoundError("no such file", where=path, fix=fix) from error

@@ -46,7 +46,8 @@ def load_scene(path: Path) -> Scene:
             blobs = [archive[f"blob_{index}"] for index in range(len(archive.files) - 1)]
             if _digest(header["scene"], blobs) != header["sha256"]:
                 raise SceneFileError(f"{path}: content does not match its sha256; write the scene again")
-            return _decode(header["scene"], Scene, blobs)
+            scene: Scene = _decode(header["scene"], Scene, blobs)
+            return scene
     except FileNotFoundError as error:
         raise SceneFileError(f"{path}: no such scene file") from error
     except (OSError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:

@@ -29,17 +29,19 @@ def points_world(depth_m: np.ndarray, K: np.ndarray, T_cam_from_world: np.ndarra
     pixels = np.stack([column + 0.5, row + 0.5, np.ones(len(z))])
     points_cam = z * (np.linalg.inv(K) @ pixels)
     rotation, translation = T_cam_from_world[:3, :3], T_cam_from_world[:3, 3:]
-    return (rotation.T @ (points_cam - translation)).T
+    points: np.ndarray = rotation.T @ (points_cam - translation)
+    return points.T
 
 
 def clip_line(clip: dict, frames: list[dict]) -> str:
     """What the camera of one clip sees of the object, and where the object is at the end."""
-    seen = alone = 0
-    for frame in frames:
-        depth, depth_object = depths_m(frame["geometry"])
-        alone += np.count_nonzero(depth_object)
-        seen += np.count_nonzero((depth_object > 0) & (depth_object <= depth))
-    points = points_world(depth_object, np.array(clip["K"]), np.array(frames[-1]["T_cam_from_world"]))
+    depths = [depths_m(frame["geometry"]) for frame in frames]
+    alone = sum(np.count_nonzero(depth_object) for _, depth_object in depths)
+    seen = sum(
+        np.count_nonzero((depth_object > 0) & (depth_object <= depth)) for depth, depth_object in depths
+    )
+    _, last = depths[-1]
+    points = points_world(last, np.array(clip["K"]), np.array(frames[-1]["T_cam_from_world"]))
     x, y, z = points.mean(axis=0)
     return f"{clip['clip_id']}  {clip['object_uid']}  {seen / alone:.0%} visible, at ({x:.3f}, {y:.3f}, {z:.3f}) m"
 

@@ -218,4 +218,6 @@ def _empty(shape: tuple[int, ...], dtype: np.dtype, *, shared: bool) -> torch.Te
         return torch.empty(shape, dtype=torch_dtype)
     n_bytes = int(np.prod(shape)) * dtype.itemsize
     storage = torch.UntypedStorage._new_shared(n_bytes)  # as torch's own default_collate does
-    return torch.empty(0, dtype=torch_dtype).set_(storage, 0, shape)  # type: ignore[call-overload]
+    tensor = torch.empty(0, dtype=torch_dtype)
+    tensor.set_(storage, 0, shape)  # type: ignore[call-overload]
+    return tensor

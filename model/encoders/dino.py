@@ -64,7 +64,7 @@ class DinoEncoder:
         return self.network.config.hidden_size
 
     def to(self, device: torch.device | str, dtype: torch.dtype) -> "DinoEncoder":
-        self.network.to(device, dtype)  # type: ignore[arg-type]  # wrapped without its overloads
+        self.network.to(device, dtype)
         return self
 
     @torch.no_grad()

@@ -282,6 +282,7 @@ def _step(
     config, accelerator = run.config, run.accelerator
     sums: dict[str, torch.Tensor] = {}
     names: list[str] = []
+    placed: PlacedBatch | None = None
     for part in range(config.accumulate):
         with clock.waiting():
             placed = next(batches)
@@ -296,6 +297,7 @@ def _step(
         for name, value in {"loss": losses.total, **losses.parts}.items():
             sums[name] = sums.get(name, 0.0) + value.detach().float() / config.accumulate
         clock.count(len(placed.batch.ids) * accelerator.num_processes)
+    assert placed is not None  # `accumulate` is at least 1
     _average_gradients(run)
     norm = nn.utils.clip_grad_norm_(run.parameters, run.optimizer_config.clip_norm)
     if not bool(torch.isfinite(norm)):  # the same on all ranks; before it reaches weights and checkpoints

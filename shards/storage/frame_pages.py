@@ -108,10 +108,10 @@ class FramePages:
                 header, length = _parse_struct(self._read(position, _HEADER_BYTES), 0)
                 kind, n_bytes, crc32, values = header[1], header[3], header[4], header[5]
                 usable = kind == _DATA_PAGE and values[2] == _PLAIN and values[1] > 0 and n_bytes >= 0
-            except (ValueError, IndexError, KeyError, TypeError):
-                usable = False
-            if not usable:
-                raise self._damaged("unreadable page header", group, column, n_rows)
+                if not usable:
+                    raise ValueError("not a page of plain values")
+            except (ValueError, IndexError, KeyError, TypeError) as error:
+                raise self._damaged("unreadable page header", group, column, n_rows) from error
             start = position + length
             pages.append(
                 _Page(

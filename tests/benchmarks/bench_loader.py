@@ -32,6 +32,7 @@ from model.data.order import RandomStream, SampleKey, random_stream, rank_batche
 from model.data.reader import choose_views
 from model.data.stream import ShardStream, StreamConfig, StreamState
 from shards.schema import FrameRow
+from shards.splits import Split
 from shards.storage.images import encode_rgb_png
 from tests.model.data.balls import VARIED, stream_config, write_balls
 
@@ -63,7 +64,7 @@ def photographic(frame: FrameRow) -> FrameRow:
 @pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> StreamConfig:
     root = tmp_path_factory.mktemp("bench") / "balls"
-    splits = [["train"] * 4, ["train"] * 4]
+    splits: list[list[Split]] = [["train"] * 4, ["train"] * 4]
     write_balls(root, splits=splits, cameras=2, n_frames=12, size_px=SIZE_PX, change_frame=photographic)
     return stream_config(
         root,
@@ -154,7 +155,6 @@ def decoded(stored: Stored, rng: np.random.Generator) -> TrainingSample:
     sample = TrainingSample(
         motion_id="",
         object_uid="",
-        split="train",
         clip_ids=("",) * VIEWS,
         frame_indices=np.zeros(VIEWS, int),
         images=images,
@@ -280,14 +280,11 @@ def test_stream_against_mosaicml_streaming(config, say, tmp_path, monkeypatch):
         stand_in_for_torchvision(tmp_path / "stand_in")
         monkeypatch.syspath_prepend(str(tmp_path / "stand_in"))
     streaming = pytest.importorskip("streaming")
-    columns = None
-    for stored in stored_samples(config):
-        fields = as_fields(stored)
-        if columns is None:
-            columns = dict.fromkeys(fields, "bytes")
-            writer = streaming.MDSWriter(out=str(tmp_path / "mds"), columns=columns, compression=None)
-        writer.write(fields)
-    writer.finish()
+    samples = [as_fields(stored) for stored in stored_samples(config)]
+    columns = dict.fromkeys(samples[0], "bytes")
+    with streaming.MDSWriter(out=str(tmp_path / "mds"), columns=columns, compression=None) as writer:
+        for fields in samples:
+            writer.write(fields)
 
     def loader(workers: int) -> DataLoader:
         streaming.base.util.clean_stale_shared_memory()  # its locks do not survive a second use

@@ -31,7 +31,7 @@ from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.training.step_generators import sample_generators
-from model.training.trainer import StepReport, train
+from model.training.trainer import StepReport, TrainingEvent, train
 
 ROOT = Path(__file__).resolve().parents[2]
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -201,7 +201,7 @@ def test_share_of_time_spent_waiting_for_data(tmp_path, say):
         change_frame=photographic,
     )
     stream = section.recipe.stream(replace(config.data, datasets=(str(root),)), surface=False)
-    reports: list[StepReport] = []
+    events: list[TrainingEvent] = []
     train(
         stage_one_task(config),
         StreamSource(config=stream, index=open_motions(stream), rank=0, ranks=1),
@@ -210,9 +210,10 @@ def test_share_of_time_spent_waiting_for_data(tmp_path, say):
         folder=tmp_path / "run",
         config_yaml="bench",
         config_sha256="bench",
-        report=reports.append,
+        report=events.append,
         accelerator=Accelerator(cpu=DEVICE.type == "cpu"),
     )
+    reports = [event for event in events if isinstance(event, StepReport)]
     shares = [report.waiting_share for report in reports[3:]]  # loader processes start during the first
     speed = statistics.median(report.samples_per_s for report in reports[3:])
     mean = statistics.mean(shares)

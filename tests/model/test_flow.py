@@ -51,7 +51,7 @@ def test_velocity_target_is_the_derivative_of_the_path() -> None:
 
 
 @given(st.floats(0.01, 0.99), st.integers(0, 1000))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_conversions_round_trip(time: float, seed: int) -> None:
     clean, noise = _random(seed, 2, 3, 4), _random(seed + 1, 2, 3, 4)
     t = torch.tensor([time, 1 - time], dtype=torch.float64)

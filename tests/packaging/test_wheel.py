@@ -58,8 +58,8 @@ def test_its_metadata(wheel):
     metadata = Parser().parsestr(archive.read(f"{folder}/METADATA").decode())
     assert metadata["Requires-Python"] == ">=3.11"
     assert metadata["License-Expression"] == "Apache-2.0"
-    assert {"datagen", "model"} <= set(metadata.get_all("Provides-Extra"))
-    required = [text for text in metadata.get_all("Requires-Dist") if "extra ==" not in text]
+    assert {"datagen", "model"} <= set(metadata.get_all("Provides-Extra", []))
+    required = [text for text in metadata.get_all("Requires-Dist", []) if "extra ==" not in text]
     assert {text.split(">")[0] for text in required} == {"numpy", "pyarrow", "OpenEXR", "fsspec"}
     assert {f"{folder}/licenses/LICENSE", f"{folder}/licenses/NOTICE"} <= set(archive.namelist())
     scripts = archive.read(f"{folder}/entry_points.txt").decode()

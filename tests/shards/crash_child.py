@@ -14,6 +14,7 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from shards.reader import open_dataset
 from shards.verify import verify_shard
@@ -46,7 +47,7 @@ def make_shard(root: Path) -> None:
         if (root / "shards/shard-00000/shard.json").exists() or is_motion_staged(root, 0, index, PROVENANCE):
             continue
         write_log(root, f"make {index}")
-        keys = {"timings_s": {"render": 1.0}, "provenance": PROVENANCE}
+        keys: dict[str, Any] = {"timings_s": {"render": 1.0}, "provenance": PROVENANCE}
         if index == N_MOTIONS - 1:
             stage_skipped_motion(root, 0, index, reason="no grasp was found", **keys)
         else:

@@ -10,7 +10,7 @@ ALL_8_BIT = np.arange(256) / 255.0
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_every_8_bit_value_comes_back_in_its_own_dtype(dtype: type) -> None:
-    srgb = ALL_8_BIT.astype(dtype)
+    srgb: np.ndarray = ALL_8_BIT.astype(dtype)
     linear = linear_from_srgb(srgb)
     assert linear.dtype == srgb_from_linear(linear).dtype == dtype
     assert (np.diff(linear) > 0).all()

@@ -86,7 +86,9 @@ def test_look_at_puts_the_target_on_the_axis_and_up_upward(view):
     center_world, target_world = view
     T_cam_from_world = geometry.look_at(center_world, target_world)
     target_cam = geometry.transform_points(T_cam_from_world, target_world[None])[0]
-    np.testing.assert_allclose(target_cam, [0, 0, np.linalg.norm(target_world - center_world)], atol=1e-9)
+    np.testing.assert_allclose(
+        target_cam, [0.0, 0.0, float(np.linalg.norm(target_world - center_world))], atol=1e-9
+    )
     np.testing.assert_allclose(geometry.camera_center(T_cam_from_world), center_world, atol=1e-9)
     assert (T_cam_from_world[:3, :3] @ [0, 0, 1])[1] < 0  # image y runs down
     assert np.linalg.det(T_cam_from_world[:3, :3]) == pytest.approx(1.0)

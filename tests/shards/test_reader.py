@@ -4,6 +4,7 @@ import dataclasses
 import pickle
 import shutil
 from pathlib import Path
+from typing import Any
 
 import fsspec
 import numpy as np
@@ -30,7 +31,7 @@ def test_clips_objects_and_frames_are_those_written(dataset_dir):
     _, written = synthetic_clip(synthetic_object(1), 1, 1, 3, 40)
     frames = dataset.read_frames("motion-000001-camera-01")
     for c in columns_of(FrameRow):
-        expected = [getattr(row, c.name) for row in written]
+        expected: Any = [getattr(row, c.name) for row in written]
         if c.dtype not in ("string", "binary"):
             expected = np.array(expected).astype(c.dtype)
         np.testing.assert_array_equal(frames[c.name], expected, err_msg=c.name)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -47,7 +48,7 @@ def test_every_column_is_explained_in_the_file_itself(row_type):
 BALL = synthetic_object(0)
 
 
-def rows():
+def rows() -> dict[str, list[Any]]:
     object_row = synthetic_object(0, mesh=False)
     clip, frames = synthetic_clip(object_row, 0, 0, 2, 24)
     return {"objects": [object_row, synthetic_object(1)], "clips": [clip], "frames": frames}
@@ -55,7 +56,7 @@ def rows():
 
 @pytest.mark.parametrize("name", ROW_TYPES)
 def test_rows_come_back_as_they_were(name):
-    row_type = ROW_TYPES[name]
+    row_type: type[Any] = ROW_TYPES[name]
     before = rows()[name]
     after = rows_from_table(table_from_rows(before, row_type, where=name), row_type, where=name)
     for old, new in zip(before, after, strict=True):

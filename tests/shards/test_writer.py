@@ -207,7 +207,6 @@ def test_what_an_interrupted_run_left_is_cleared_away(tmp_path):
 
 def test_committing_holds_one_clip_in_memory(tmp_path):
     object_row = synthetic_object(0)
-    blob = {"rgb": bytes(400_000)}
     for motion_index in range(12):
         clip, frames = synthetic_clip(object_row, motion_index, 0, 3, 24)
         stage_motion(
@@ -216,7 +215,7 @@ def test_committing_holds_one_clip_in_memory(tmp_path):
             motion_index,
             object_row=object_row,
             clips=[clip],
-            frames=[dataclasses.replace(frame, **blob) for frame in frames],
+            frames=[dataclasses.replace(frame, rgb=bytes(400_000)) for frame in frames],
             timings_s={},
             provenance=PROVENANCE,
         )

@@ -1,13 +1,13 @@
 """Shader graphs written as expressions: sockets go in, sockets come out."""
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import bpy
 
 __all__ = ["Graph", "Input", "new_material", "replace_surface", "surface"]
 
 # A number, a colour or vector, or the output of another node.
-Input = float | tuple[float, ...] | bpy.types.NodeSocket
+Input: TypeAlias = float | tuple[float, ...] | bpy.types.NodeSocket
 
 _OUTPUT = "surface output"
 

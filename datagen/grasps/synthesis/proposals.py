@@ -252,16 +252,23 @@ def _try_closing(
     """Close without dynamics and judge the contacts; None when they cannot hold anything."""
     rates = closing_rates(world.body, curl)
     angles = open_rad
-    for _ in range(CLOSE_STEPS):
-        world.place_hand(wrist, angles)
-        world.detect()
-        contacts = world.contacts()
+    contacts = _contacts_at(world, wrist, angles)
+    for _ in range(CLOSE_STEPS - 1):
         touching = np.zeros(16)
         touching[contacts.bone] = 1.0
         angles, moving = closing_step(world, angles, open_rad, rates, CLOSE_STEP_RAD, touching)
         if not moving:
             break
+        contacts = _contacts_at(world, wrist, angles)
     return _judge(world, contacts, com)
+
+
+def _contacts_at(
+    world: GraspWorld, wrist: WristTarget, angles_rad: Float[np.ndarray, " hinge"]
+) -> HandContacts:
+    world.place_hand(wrist, angles_rad)
+    world.detect()
+    return world.contacts()
 
 
 def _judge(world: GraspWorld, contacts: HandContacts, com: Float[np.ndarray, "3"]) -> float | None:

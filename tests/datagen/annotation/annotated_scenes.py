@@ -1,6 +1,7 @@
 """Small scenes whose geometry buffers are tested: a body, a rod for a hand or a posed hand, a table, cameras."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -140,7 +141,11 @@ def make_hand_scene(size: tuple[int, int]) -> tuple[Scene, np.ndarray]:
     )
     dressed = dress_hand(hand, style)
     turn = np.array([[1.3, 0.2, 0.1], [1.4, 0.1, 0.2]])
-    at_origin = {"orientation_world": turn, "hand_pose": np.full((2, 45), 0.05), "flat_hand_mean": True}
+    at_origin: dict[str, Any] = {
+        "orientation_world": turn,
+        "hand_pose": np.full((2, 45), 0.05),
+        "flat_hand_mean": True,
+    }
     rest = pose_hand(hand, translation_world=np.zeros((2, 3)), **at_origin)
     beside = np.array([0.04, 0.0, 0.28]) - rest.joints_world[:, 4]
     posed = pose_hand(hand, translation_world=beside, **at_origin)

@@ -96,8 +96,8 @@ def test_the_left_body_is_the_mirror_of_the_right():
     right = load_open_hand("right")
     bodies = [build_hand_body(shape_hand(m, np.zeros(10))) for m in (right, mirror_hand(right))]
     flip = np.array([-1.0, 1.0, 1.0])
-    for a, b in zip(bodies[0].pads, bodies[1].pads):
-        assert np.allclose(a.position_bone * flip, b.position_bone, atol=1e-9)
+    for pad, mirrored in zip(bodies[0].pads, bodies[1].pads):
+        assert np.allclose(pad.position_bone * flip, mirrored.position_bone, atol=1e-9)
     assert np.allclose(bodies[0].dorsal * flip, bodies[1].dorsal)
     for a, b in zip(bodies[0].hinges, bodies[1].hinges):
         # A mirrored turn has its axis flipped like a pseudo-vector.

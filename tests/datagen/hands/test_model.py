@@ -89,7 +89,7 @@ def test_offsets_from_the_mean_pose_equal_the_full_pose() -> None:
     _assert_same(pose_hand(hand, **pose, flat_hand_mean=False), pose_hand(hand, **full, flat_hand_mean=True))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=SEEDS)
 def test_turning_the_wrist_turns_the_whole_hand_about_the_wrist(seed: int) -> None:
     hand = random_shape(seed, load_open_hand())
@@ -109,7 +109,7 @@ def test_turning_the_wrist_turns_the_whole_hand_about_the_wrist(seed: int) -> No
     )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=SEEDS)
 def test_the_mirrored_hand_in_the_mirrored_pose_is_the_mirror_image(seed: int) -> None:
     right, left = load_open_hand("right"), load_open_hand("left")

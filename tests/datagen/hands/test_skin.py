@@ -4,6 +4,7 @@ import json
 import time
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -40,7 +41,7 @@ def mean_rgb(skin: SkinBasis, draws: np.ndarray) -> np.ndarray:
     return channels[0] + draws @ np.stack(channels[1:])
 
 
-def _table() -> dict[str, dict[str, list[float]]]:
+def _table() -> dict[str, Any]:
     return json.loads((files("datagen.hands") / "data" / "skin" / "skin.json").read_text())
 
 

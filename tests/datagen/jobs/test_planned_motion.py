@@ -38,7 +38,7 @@ def test_a_simulated_left_hand_grasps_the_object_itself(tmp_path: Path):
     """Simulated with the mirrored object, mirrored back: the left hand touches the real mesh."""
     config = load_config(small_config(tmp_path))
     wedge = trimesh.Trimesh(  # no mirror symmetry in any plane
-        [[0, 0, 0], [0.09, 0, 0], [0, 0.05, 0], [0.02, 0.03, 0.12]],
+        [[0.0, 0.0, 0.0], [0.09, 0.0, 0.0], [0.0, 0.05, 0.0], [0.02, 0.03, 0.12]],
         [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
     )
     wedge.export(tmp_path / "meshes" / "wedge.ply")

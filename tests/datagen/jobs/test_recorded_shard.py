@@ -152,7 +152,12 @@ def test_a_store_that_changes_after_planning_is_refused_not_drawn(inputs, tmp_pa
     """A licence that the selection never allowed must not come in through the worker."""
     shutil.copytree(inputs, tmp_path / "inputs")
     own = tmp_path / "inputs"
-    path = write_config(own, lambda c: (small(c), c["objects"].update(textures="when_present")))
+
+    def change(config: dict[str, Any]) -> None:
+        small(config)
+        config["objects"]["textures"] = "when_present"
+
+    path = write_config(own, change)
     glbs, hidden = own / "store" / "glbs", own / "hidden"
     metadata = own / "store" / "metadata"
     shutil.move(glbs, hidden)

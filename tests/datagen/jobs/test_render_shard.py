@@ -134,7 +134,9 @@ def nan_mesh(path: Path) -> None:
 
 
 def flat_mesh(path: Path) -> None:
-    trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], [[0, 1, 2]], process=False).export(path)
+    trimesh.Trimesh([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.2, 0.0, 0.0]], [[0, 1, 2]], process=False).export(
+        path
+    )
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,7 @@ def is_done(event: Event) -> bool:
 
 
 def test_events_arrive_and_other_output_goes_to_the_log(tmp_path):
-    events = []
+    events: list[dict[str, Any]] = []
     code = (
         EMIT
         + "print('chatter'); print('{not an event'); emit(phase='render', done=1); emit(phase='done', n=3)"
@@ -62,20 +63,20 @@ def test_death_by_signal_is_named(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="the kernel call exists on Linux")
 def test_child_dies_when_its_parent_is_killed():
-    grandchild = EMIT + "die_with_parent(); import time; time.sleep(60)"
+    grandchild = EMIT + "die_with_parent(); print('ready', flush=True); import time; time.sleep(600)"
     code = (
         "import subprocess, sys, time\n"
         f"child = subprocess.Popen([sys.executable, '-c', {grandchild!r}])\n"
         "print(child.pid, flush=True)\n"
-        "time.sleep(60)\n"
+        "time.sleep(600)\n"
     )
     parent = subprocess.Popen(python(code), stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     pid = int(parent.stdout.readline())
-    time.sleep(1.0)  # the grandchild imports and asks the kernel
+    assert parent.stdout.readline() == "ready\n"
     parent.send_signal(signal.SIGKILL)
     parent.wait()
-    deadline = time.monotonic() + 5.0
+    deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline and _is_running(pid):
         time.sleep(0.05)
     assert not _is_running(pid)

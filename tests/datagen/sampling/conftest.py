@@ -6,7 +6,7 @@ import trimesh
 import yaml
 from scipy.spatial.transform import Rotation
 
-from datagen.grasps.sequence import GraspQuality, GraspSequence, TableEdge
+from datagen.grasps.sequence import GraspQuality, GraspSequence, StartKind, TableEdge
 from datagen.hands.model import ShapedHand, load_open_hand, pose_hand, shape_hand
 from datagen.hands.skin import SkinBasis
 from datagen.objects.asset.object_asset import ConvexPart, ObjectAsset, WatertightMesh
@@ -159,7 +159,9 @@ def asset() -> ObjectAsset:
 def make_sequence(hand):
     """A can on a table, a hand beside it that from GRASP_FRAME on carries and turns it."""
 
-    def make(start: str = "table", n_frames: int = N_FRAMES, edge: TableEdge | None = None) -> GraspSequence:
+    def make(
+        start: StartKind = "table", n_frames: int = N_FRAMES, edge: TableEdge | None = None
+    ) -> GraspSequence:
         time = np.maximum(np.arange(n_frames) - GRASP_FRAME, 0) / FPS
         lift = 0.25 * (1.0 - np.exp(-3.0 * time))
         turn = Rotation.from_rotvec(np.outer(0.8 * (1.0 - np.exp(-time)), [0.3, 0.1, 1.0]))

@@ -1,5 +1,7 @@
 """Every hand and object vertex is inside every frame, the object drifts boundedly, cameras turn smoothly."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -25,7 +27,7 @@ STYLE = PathStyle(
     shake_deg=1.0,
     shake_m=0.004,
 )
-STYLES = {
+STYLES: dict[str, dict[str, Any]] = {
     "orbit": {"azimuth_sweep_deg": (60.0, 360.0)},
     "arc": {"azimuth_sweep_deg": (20.0, 80.0), "elevation_sweep_deg": (10.0, 50.0)},
     "handheld": {"shake_deg": 4.0, "shake_m": 0.015},

@@ -80,12 +80,12 @@ def test_everything_is_written(finished, video):
 
 def test_the_mesh_is_watertight_and_the_voxels_are_counted(finished):
     record = record_of(finished)
-    (mesh,) = trimesh.load(finished / "object.glb").geometry.values()
+    (mesh,) = trimesh.load_scene(finished / "object.glb").geometry.values()
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
     assert len(mesh.faces) == record["surface"]["faces"]
     np.testing.assert_allclose(mesh.extents[[0, 2, 1]], record["surface"]["bounding_box_sides"], atol=1e-3)
-    voxels = trimesh.load(finished / "voxels.ply")
+    voxels = trimesh.load_mesh(finished / "voxels.ply")
     assert np.abs(voxels.vertices).max() <= 0.5
     assert record["voxels"]["occupied"] > 0
     turn = read_frames(finished / "turntable.mp4", ReadLimits(max_frames=100, max_side_px=64))

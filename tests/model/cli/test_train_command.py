@@ -15,7 +15,7 @@ from model.cli.main import main
 from model.cli.weights import weights
 from model.recipes.config import read_settings
 from shards.reader import open_dataset
-from shards.splits import SplitRule
+from shards.splits import Split, SplitRule
 from shards.storage.parquet import file_record
 from shards.storage.records import write_record
 from tests.model.data.balls import uid_of_split, write_balls
@@ -172,7 +172,7 @@ def test_no_finished_shard(tmp_path):
 
 def test_an_object_in_two_splits(dataset, tmp_path):
     uid = uid_of_split("train", 0)
-    motions = ["val"] * (int(uid.removeprefix("ball-")) + 1)
+    motions: list[Split] = ["val"] * (int(uid.removeprefix("ball-")) + 1)
     rule = SplitRule(val_fraction=1.0, test_fraction=0.0)
     other = write_balls(tmp_path / "other", splits=[motions], cameras=1, rule=rule)
     text = train_on(tmp_path, dataset, other)

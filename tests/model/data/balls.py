@@ -9,7 +9,7 @@ from model.data.batch import Batch
 from model.data.config import DataConfig, StreamConfig
 from model.data.crop import Augmentation
 from model.data.stream import ShardStream
-from shards.schema import FrameRow, ObjectRow
+from shards.schema import ClipRow, FrameRow, ObjectRow
 from shards.splits import Split, SplitRule, split_of_object
 from shards.writer import begin_dataset, commit_shard, stage_motion
 from tests.shards.synthetic import (
@@ -105,7 +105,8 @@ def _stage(
     size_px: int,
     change_frame: Callable[[FrameRow], FrameRow],
 ) -> None:
-    clips, frames = [], []
+    clips: list[ClipRow] = []
+    frames: list[FrameRow] = []
     for camera in range(cameras):
         clip, clip_frames = synthetic_clip(object_row, motion, camera, n_frames, size_px)
         clips.append(replace(clip, split=split))

@@ -26,7 +26,7 @@ def batches(rank=0, world_size=1, state=START, *, motions=7, per_motion=3, batch
     )
 
 
-@settings(deadline=None, max_examples=40)
+@settings(max_examples=40)
 @given(
     motions=st.integers(1, 20),
     per_motion=st.integers(1, 3),

@@ -6,6 +6,10 @@ import numpy as np
 from model.data.batch import OCCUPANCY_VOXELS
 from shards.geometry import project_points, transform_points
 
+FINE = 9  # silhouettes are drawn this much finer; odd, so that the middle of the fine pixels is the pixel's centre
+# Corners are rounded to fine pixels (up to 0.71 of one), OpenCV also fills those that an outline touches
+# (another 0.71), and distances are between their centres (1).
+RENDER_ERROR_PX = 2.5 / FINE
 _CORNERS = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
 
 
@@ -28,14 +32,30 @@ def render_mask(
     occupancy: np.ndarray, T_cam_from_canonical: np.ndarray, K: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
     """Silhouette (bool): pixels whose centre is covered by an occupied voxel."""
-    fine = 8  # OpenCV also fills the pixels that an outline touches, so draw finely and take the centres
-    K_fine = np.diag([fine, fine, 1.0]) @ K
-    mask = np.zeros((size[1] * fine, size[0] * fine), np.uint8)
+    fine = _fine_silhouette(occupancy, T_cam_from_canonical, K, size)
+    return fine[FINE // 2 :: FINE, FINE // 2 :: FINE].astype(bool)
+
+
+def outline_distance_px(
+    occupancy: np.ndarray, T_cam_from_canonical: np.ndarray, K: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    """From each pixel centre to the outline of the silhouette, positive inside; right to RENDER_ERROR_PX."""
+    fine = _fine_silhouette(occupancy, T_cam_from_canonical, K, size)
+    inside = cv2.distanceTransform(fine, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outside = cv2.distanceTransform(1 - fine, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return (inside - outside)[FINE // 2 :: FINE, FINE // 2 :: FINE] / FINE
+
+
+def _fine_silhouette(
+    occupancy: np.ndarray, T_cam_from_canonical: np.ndarray, K: np.ndarray, size: tuple[int, int]
+) -> np.ndarray:
+    K_fine = np.diag([FINE, FINE, 1.0]) @ K
+    mask = np.zeros((size[1] * FINE, size[0] * FINE), np.uint8)
     for low, high in _bars(occupancy):
         corners = (low + _CORNERS * (high - low)) / OCCUPANCY_VOXELS - 0.5
         pixels = project_points(transform_points(T_cam_from_canonical, corners), K_fine) - 0.5
-        cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), 1)
-    return mask[fine // 2 :: fine, fine // 2 :: fine].astype(bool)
+        cv2.fillConvexPoly(mask, cv2.convexHull(np.round(pixels).astype(np.int32)), [1])
+    return mask
 
 
 def _bars(occupancy: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -214,7 +214,7 @@ def test_joints_outside_the_image_and_behind_the_camera_do_not_count() -> None:
     net = network()
     losses = hand_losses(net(batch.images.flatten(0, 1)), batch, LOSS)
     assert losses["joints"].tolist() == [0.0, 0.0]
-    sum(loss.sum() for loss in losses.values()).backward()  # type: ignore[union-attr]
+    sum(loss.sum() for loss in losses.values()).backward()
     assert all(torch.isfinite(p.grad).all() for p in net.parameters() if p.grad is not None)
 
 

@@ -82,7 +82,7 @@ def checkpoint(tmp_path: Path) -> Path:
     """With hyper-parameters of a class that is not installed here, as in the published file."""
     module = ModuleType("yacs_not_here")
 
-    class CfgNode(dict):  # type: ignore[type-arg]
+    class CfgNode(dict):
         def __init__(self, **values: object) -> None:
             super().__init__(values)
             self.__dict__["frozen"] = True

@@ -68,12 +68,13 @@ def test_hand_regions_hold_the_joints_of_hands_that_are_seen():
     torch.manual_seed(0)
     network = HandNet(HandNetConfig(image_size=64, stem=(8, 8), decoder=8)).eval()
     images = torch.rand(2, 3, SIZE, SIZE)
+    bias = network.get_parameter("maps.bias")
     with torch.no_grad():
-        network.maps.bias[0] = 50.0
+        bias[0] = 50.0
     for region in hand_regions(network, images):
         assert region.any()
         filled_rows = np.flatnonzero(region.any(axis=1))
         assert (np.diff(filled_rows) == 1).all()  # convex
     with torch.no_grad():
-        network.maps.bias[0] = -50.0
+        bias[0] = -50.0
     assert not any(region.any() for region in hand_regions(network, images))

@@ -10,7 +10,7 @@ def paper_adapters() -> dict[str, tuple[int, ...]]:
         "cross_attn.to_kv": (2048, 1024),
         "cross_attn.to_out": (1024, 1024),
     }
-    expected = {}
+    expected: dict[str, tuple[int, ...]] = {}
     for j in range(24):
         for layer, (rows, columns) in shapes.items():
             expected[f"blocks.{j}.{layer}.lora_A.default.weight"] = (64, columns)

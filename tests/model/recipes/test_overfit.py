@@ -14,7 +14,7 @@ from model.recipes.config import parse_config, read_settings
 from model.recipes.stage_one_config import StageOneTrainingConfig
 from model.recipes.train_component import train_component
 from shards.geometry import intrinsics_from_fov
-from shards.schema import FrameRow
+from shards.schema import ClipRow, FrameRow
 from shards.storage.images import MASK_BITS, decode_masks, encode_masks, encode_rgb_png, mask_box_px
 from shards.writer import begin_dataset, commit_shard, stage_motion
 from tests.model.data.balls import uid_of_split
@@ -48,7 +48,8 @@ def write_motion(root: Path) -> Path:
         T = frame.T_cam_from_world @ frame.T_world_from_obj @ T_objmesh_from_canonical
         return _with_object(frame, render_mask(occupancy, T, K, (SIZE_PX, SIZE_PX)))
 
-    clips, frames = [], []
+    clips: list[ClipRow] = []
+    frames: list[FrameRow] = []
     for camera in range(CAMERAS):
         clip, clip_frames = synthetic_clip(object_row, 0, camera, FRAMES, SIZE_PX)
         clips.append(clip)

@@ -65,16 +65,17 @@ def cell_vae() -> StructureVae:
     )
     plus_minus, center = torch.tensor([1.0, -1.0]), (slice(None), slice(None), 1, 1, 1)
     with torch.no_grad():
-        for half in (vae.encoder, vae.decoder):
-            for layer in (half.input_layer, half.out_layer[2]):
-                layer.weight.zero_()
-                layer.bias.zero_()
+        weights = dict(vae.named_parameters())
+        for layer in ("input_layer", "out_layer.2"):
+            for half in ("encoder", "decoder"):
+                weights[f"{half}.{layer}.weight"].zero_()
+                weights[f"{half}.{layer}.bias"].zero_()
         share = 1 / (64 // CELLS) ** 3  # of a voxel in the mean of its cell
-        vae.encoder.input_layer.weight[center] = 2 * share * plus_minus[:, None]
-        vae.encoder.input_layer.bias -= plus_minus
-        vae.encoder.out_layer[2].weight[center] = LATENT * plus_minus
-        vae.decoder.input_layer.weight[center] = plus_minus[:, None]
-        vae.decoder.out_layer[2].weight[center] = plus_minus
+        weights["encoder.input_layer.weight"][center] = 2 * share * plus_minus[:, None]
+        weights["encoder.input_layer.bias"] -= plus_minus
+        weights["encoder.out_layer.2.weight"][center] = LATENT * plus_minus
+        weights["decoder.input_layer.weight"][center] = plus_minus[:, None]
+        weights["decoder.out_layer.2.weight"][center] = plus_minus
     return vae.eval().requires_grad_(False)
 
 

@@ -62,6 +62,12 @@ class KnowingFlow(DualBranchFlow):
         )
 
 
+def tensors_of(condition: DualCondition) -> tuple[Tensor, Tensor]:
+    """Features and images; both have to be there."""
+    assert condition.images is not None
+    return condition.features, condition.images
+
+
 def batch_of(samples: int = SAMPLES) -> Batch:
     """Random shapes, masks and images; masks have the resolution of the branch, so that nothing is averaged."""
     generator = torch.Generator().manual_seed(1)
@@ -160,8 +166,8 @@ def test_no_condition_is_dropped_at_zero_and_every_one_at_one() -> None:
     for share in (0.0, 1.0):
         task, flow = task_on(batch, drop_condition=share)
         loss_of(task, batch)
-        (condition,), whole = flow.conditions, task.condition(batch.images)
-        for given, found in ((whole.features, condition.features), (whole.images, condition.images)):
+        (condition,), whole = map(tensors_of, flow.conditions), tensors_of(task.condition(batch.images))
+        for given, found in zip(whole, condition):
             assert given.flatten(1).any(1).all()
             assert torch.equal(found, torch.zeros_like(given) if share else given)
 
@@ -171,12 +177,13 @@ def test_a_condition_is_dropped_whole_and_as_often_as_configured() -> None:
     task, flow = task_on(batch, drop_condition=share)
     for step in range(steps):
         loss_of(task, batch, step)
-    whole, dropped = task.condition(batch.images), 0
+    (features, images), dropped = tensors_of(task.condition(batch.images)), 0
     for condition in flow.conditions:
-        kept = condition.features.flatten(1).any(1)
-        assert torch.equal(condition.images.flatten(1).any(1), kept)
-        assert torch.equal(condition.features[kept], whole.features[kept])
-        assert torch.equal(condition.images[kept], whole.images[kept])
+        found_features, found_images = tensors_of(condition)
+        kept = found_features.flatten(1).any(1)
+        assert torch.equal(found_images.flatten(1).any(1), kept)
+        assert torch.equal(found_features[kept], features[kept])
+        assert torch.equal(found_images[kept], images[kept])
         dropped += int((~kept).sum())
     draws = steps * SAMPLES
     assert abs(dropped / draws - share) < 4 * math.sqrt(share * (1 - share) / draws)
@@ -218,10 +225,9 @@ def test_guidance_compares_the_condition_with_zeros() -> None:
     batch = batch_of()
     task, flow = task_on(batch, guidance=1.0)
     task.predict(batch.images, torch.Generator().manual_seed(0))
-    whole = task.condition(batch.images)
+    whole = tensors_of(task.condition(batch.images))
     assert len(flow.conditions) == 6  # three steps
     for with_condition, without in zip(flow.conditions[::2], flow.conditions[1::2]):
-        assert torch.equal(with_condition.features, whole.features)
-        assert torch.equal(with_condition.images, whole.images)
-        assert not without.features.any()
-        assert not without.images.any()
+        for found, zeros, given in zip(tensors_of(with_condition), tensors_of(without), whole):
+            assert torch.equal(found, given)
+            assert not zeros.any()

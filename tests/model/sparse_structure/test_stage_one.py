@@ -145,7 +145,7 @@ def test_the_mask_that_the_hand_network_finds_is_scored_beside_the_found_one(tas
     for bias, expected in ((50.0, float(batch.object_amodal.float().mean())), (-50.0, 0.0)):
         with torch.no_grad():  # the object everywhere, then nowhere
             network.maps.weight[1] = 0.0
-            network.maps.bias[1] = bias
+            network.get_parameter("maps.bias")[1] = bias
         metrics = looking.measure([batch]).evaluation().metrics
         assert metrics["found_visible_iou"] == pytest.approx(expected)
         assert metrics["occluded_found_visible_iou"] == pytest.approx(expected)

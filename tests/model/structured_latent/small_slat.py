@@ -1,6 +1,7 @@
 """Small networks of stage 2 and random voxels for them."""
 
 from dataclasses import replace
+from typing import TypeVar
 
 import torch
 from torch import nn
@@ -50,6 +51,8 @@ PAPER_FLOW = SlatFlowConfig(
 )
 TWO_LEVELS = replace(FLOW, patch=4, io_channels=(8, 16))
 
+_Network = TypeVar("_Network", bound=nn.Module)
+
 
 def voxels(fraction: float, channels: int, *, batch: int = 2, resolution: int = 8) -> SparseTensor:
     """Random features on about `fraction` of the cells; float64."""
@@ -64,7 +67,7 @@ def one_sample(x: SparseTensor, sample: int) -> SparseTensor:
     return SparseTensor.from_samples([x.features[rows]], [x.grid.coordinates[rows]], x.grid.resolution)
 
 
-def trained(network: nn.Module) -> nn.Module:
+def trained(network: _Network) -> _Network:
     """In float64, every parameter moved off its initial value: zeros hide what they multiply."""
     generator = torch.Generator().manual_seed(1)
     network.double()

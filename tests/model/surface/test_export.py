@@ -58,7 +58,7 @@ def test_glb_round_trip_through_trimesh(mesh: SurfaceMesh) -> None:
     T_objmesh_from_canonical = np.diag([0.12, 0.12, 0.12, 1.0])
     T_objmesh_from_canonical[:3, 3] = 0.01, -0.02, 0.03
     glb = glb_bytes(mesh, T_objmesh_from_canonical)
-    (loaded,) = trimesh.load(io.BytesIO(glb), file_type="glb", process=False).geometry.values()
+    (loaded,) = trimesh.load_scene(io.BytesIO(glb), file_type="glb", process=False).geometry.values()
     assert loaded.is_watertight
     assert loaded.volume == pytest.approx(
         0.12**3 * trimesh.Trimesh(mesh.vertices, mesh.faces).volume, rel=1e-5
@@ -88,7 +88,7 @@ def test_voxels_ply_round_trip() -> None:
     voxels = np.unique(rng.integers(0, 64, (500, 3)), axis=0)
     colors = rng.random((len(voxels), 3)).astype(np.float32)
     mesh = voxel_mesh(voxels, 64, colors)
-    loaded = trimesh.load(io.BytesIO(voxels_ply(voxels, 64, colors)), file_type="ply", process=False)
+    loaded = trimesh.load_mesh(io.BytesIO(voxels_ply(voxels, 64, colors)), file_type="ply", process=False)
     np.testing.assert_allclose(loaded.vertices, mesh.vertices, atol=1e-7)
     np.testing.assert_array_equal(loaded.faces, mesh.faces)
     assert np.abs(loaded.visual.vertex_colors[:, :3] / 255.0 - mesh.colors).max() <= 0.5 / 255 + 1e-6

@@ -25,7 +25,7 @@ def _watertight(mesh) -> bool:
     return shape.is_watertight and shape.is_winding_consistent
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     seed=st.integers(0, 2**32 - 1),
     resolution=st.integers(2, 9),
@@ -72,7 +72,7 @@ def test_every_pattern_of_two_neighbouring_cells_along_every_axis() -> None:
     assert len(np.unique(mesh.vertices, axis=0)) == len(mesh.vertices)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_exact_zeros_make_no_flat_triangle(seed) -> None:
     fields = noise_fields(seed, resolution=6, deformation=0.0, levels=1)
@@ -182,7 +182,7 @@ def test_nothing_inside_is_one_clear_line() -> None:
         extract_surface(empty, OPEN)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.1, 0.6, 0.9]))
 def test_simplified_noise_stays_manifold(seed, share) -> None:
     """As many handles as noise has forbid few faces; then the limit on moves decides."""

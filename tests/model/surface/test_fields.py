@@ -1,5 +1,7 @@
 """The 101 channels in TRELLIS' order, and what corners make of them."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -53,9 +55,9 @@ def test_shared_corners_are_averaged_before_tanh_and_sigmoid() -> None:
     row = lattice.row[tuple(np.array([1, 1, 1]) - lattice.origin)]
     mean = torch.stack([channels[0], channels[1], channels[2]])
     of = [7, 6, 4]
-    distance = sum(mean[v, c] for v, c in enumerate(of)) / 3 - 1 / RESOLUTION
-    deform = sum(mean[v, 8 + 3 * c : 11 + 3 * c] for v, c in enumerate(of)) / 3
-    color = sum(mean[v, 53 + 6 * c : 56 + 6 * c] for v, c in enumerate(of)) / 3
+    distance = torch.stack([mean[v, c] for v, c in enumerate(of)]).mean() - 1 / RESOLUTION
+    deform = torch.stack([mean[v, 8 + 3 * c : 11 + 3 * c] for v, c in enumerate(of)]).mean(0)
+    color = torch.stack([mean[v, 53 + 6 * c : 56 + 6 * c] for v, c in enumerate(of)]).mean(0)
     assert lattice.distances[row] == pytest.approx(float(distance), abs=1e-6)
     expected = 1 / RESOLUTION - 0.5 + (1 - 1e-8) / (2 * RESOLUTION) * torch.tanh(deform)
     np.testing.assert_allclose(lattice.positions[row], expected.numpy(), atol=1e-3 / RESOLUTION)
@@ -74,7 +76,7 @@ def test_dense_grids_cover_every_corner_once() -> None:
 
 
 def _fields(**changes) -> SurfaceFields:
-    values = {
+    values: dict[str, Any] = {
         "resolution": 4,
         "voxels": np.array([[0, 0, 0], [3, 3, 3]]),
         "distances": np.zeros((2, 8), np.float32),

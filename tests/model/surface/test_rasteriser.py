@@ -49,6 +49,7 @@ def test_ray_casting_sees_the_same_faces() -> None:
         )
         parts.append(box.apply_translation(rng.uniform(-0.3, 0.3, 3)))
     shape = trimesh.util.concatenate(parts)
+    assert isinstance(shape, trimesh.Trimesh)
     image = render_mesh(_mesh(shape), K, T_CAM_FROM_OBJ, SIZE, PLAIN)
     T_obj_from_cam = invert_transform(T_CAM_FROM_OBJ)
     rays = (pixel_rays_cam(K, SIZE) @ T_obj_from_cam[:3, :3].T).reshape(-1, 3)

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Generator, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,7 +18,7 @@ from model.data.batch import Batch
 from model.training.config import OptimizerConfig, TrainerConfig
 from model.training.step_generators import normal_like
 from model.training.task import Losses, Measurements
-from model.training.trainer import PlacedBatch, StepReport, train
+from model.training.trainer import PlacedBatch, StepReport, TrainingEvent, train
 
 EPOCH = 12  # samples
 OPTIMIZER = OptimizerConfig(
@@ -83,7 +84,7 @@ class ToySource:
             self.seen += positions
             rows = [sample(position, poison=position == self.poison) for position in positions]
             samples_consumed += self.global_batch
-            stacked = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
+            stacked: dict[str, Any] = {name: torch.stack([row[name] for row in rows]) for name in rows[0]}
             yield PlacedBatch(
                 batch=Batch(
                     **stacked,
@@ -109,7 +110,7 @@ class ToyTask:
         return self.net
 
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
-        self.net.calls += 1
+        self.net.get_buffer("calls").add_(1)
         noise = normal_like(batch.images, generators)
         predicted = self.net(batch.images + 0.1 * noise)
         error = (predicted - batch.images.mean(dim=(1, 3, 4))).square().mean()
@@ -128,9 +129,10 @@ def main(folder: str, steps: str, global_batch: str, fault: str = "") -> None:
     source = ToySource(int(global_batch), rank=accelerator.process_index, ranks=accelerator.num_processes)
     task = ToyTask()
 
-    def slow(report: StepReport) -> None:
-        print(report.step, flush=True)
-        time.sleep(0.2 if fault == "slow" else 0.0)
+    def slow(event: TrainingEvent) -> None:
+        if isinstance(event, StepReport):
+            print(event.step, flush=True)
+            time.sleep(0.2 if fault == "slow" else 0.0)
 
     train(
         task,

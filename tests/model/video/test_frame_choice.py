@@ -40,7 +40,7 @@ def as_frames(images: list[np.ndarray]) -> VideoFrames:
     return VideoFrames(source="test", kind="video", frames=frames, n_source_frames=3 * len(images), notes=())
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     repeats=st.lists(st.integers(1, 6), min_size=2, max_size=7),
     count=st.integers(1, 8),

@@ -69,7 +69,7 @@ def test_masks_are_png_at_source_size(tmp_path: Path) -> None:
     assert top[:, :70].max() == 0
     assert top[:89, 71:249].min() == 255
     assert top[91:].max() == 0
-    assert ((top | bottom)[:, 71:249] == 255).all()
+    assert (np.bitwise_or(top, bottom)[:, 71:249] == 255).all()
 
 
 def test_contact_sheet_shows_every_tile(tmp_path: Path) -> None:

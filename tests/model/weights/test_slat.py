@@ -146,9 +146,8 @@ def test_pointwise_kernels_are_those_that_spconv_multiplied_by(tmp_path: Path) -
         skip = decoder.upsample[level].skip_connection
         assert isinstance(skip, nn.Module)
         torch.testing.assert_close(skip(x).features, expected)
-    assert not torch.equal(
-        weight, load_file(tmp_path / "out.safetensors")[f"{SURFACE}upsample.1.skip_connection.conv.weight"]
-    )
+        name = f"{SURFACE}upsample.{level}.skip_connection.conv.weight"
+        assert not torch.equal(weight, load_file(tmp_path / "out.safetensors")[name])
 
 
 def _stage_two() -> ViewConditionedSlatFlow:

@@ -1,6 +1,7 @@
 """PNG against two other implementations, OpenEXR against its promised error, and damage."""
 
 import io
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,7 +44,7 @@ def test_pillow_and_opencv_read_our_png(image):
     data = encode_png(image)
     np.testing.assert_array_equal(np.asarray(Image.open(io.BytesIO(data))), image)
     read = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    order = {1: slice(None), 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2] if image.ndim == 3 else 1]
+    order: Any = {1: slice(None), 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2] if image.ndim == 3 else 1]
     np.testing.assert_array_equal(read if image.ndim == 2 else read[..., order], image)
 
 
@@ -54,7 +55,7 @@ def test_we_read_the_png_of_pillow_and_opencv(image, level):
     np.testing.assert_array_equal(decode_png(stream.getvalue()), image)
     for strategy in (cv2.IMWRITE_PNG_STRATEGY_DEFAULT, cv2.IMWRITE_PNG_STRATEGY_FILTERED):
         _, data = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_STRATEGY, strategy])
-        order = {1: slice(None), 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2] if image.ndim == 3 else 1]
+        order: Any = {1: slice(None), 3: [2, 1, 0], 4: [2, 1, 0, 3]}[image.shape[2] if image.ndim == 3 else 1]
         decoded = decode_png(data.tobytes())
         np.testing.assert_array_equal(decoded if image.ndim == 2 else decoded[..., order], image)
 

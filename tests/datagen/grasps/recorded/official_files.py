@@ -55,7 +55,7 @@ def still_arrays(object_id: str, n_frames: int = 155, *, rise_m: float = 0.2) ->
     rise = np.zeros((n_frames, 3), dtype=np.float32)
     rise[:, 2] = rise_m * np.clip((np.arange(n_frames) - n_frames + 26) / 25, 0.0, 1.0)
     zeros = np.zeros((n_frames, 3), dtype=np.float32)
-    start = START.astype(np.float32) + np.float32([0.0, 0.0, 0.05])
+    start = START.astype(np.float32) + np.array([0.0, 0.0, 0.05], np.float32)
     return {
         "right_hand": {
             "trans": rise + start,

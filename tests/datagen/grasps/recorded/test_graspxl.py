@@ -5,6 +5,7 @@ import pickle
 import shutil
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def ids(root: Path, **options: object) -> list[str]:
+def ids(root: Path, **options: Any) -> list[str]:
     return [file.sequence_id for file in find_sequences(root, **options)]
 
 

@@ -180,7 +180,7 @@ def test_numbers_must_be_positive():
 
 def mesh_surface(path: Path) -> ObjectSurface:
     """The closed mesh of a sample object; its file frame is the object frame."""
-    mesh = trimesh.load(path, process=False, force="mesh")
+    mesh = trimesh.load_mesh(path, process=False)
     surface = ObjectSurface.__new__(ObjectSurface)
     surface.verts = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     surface.faces = np.ascontiguousarray(mesh.faces, dtype=np.int64)

@@ -21,7 +21,7 @@ def test_straight_ends_at_the_shift():
     assert np.allclose(straight(start, np.array([0, 0, 0.2]), 50).positions_world[-1], [1, 1, 1.2])
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_turns_join_up_and_keep_every_carried_point_above_the_table(hand, config, seed):
     rng = np.random.default_rng(seed)

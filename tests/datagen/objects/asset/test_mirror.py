@@ -43,8 +43,9 @@ def test_mirror_image_is_the_same_thing_seen_in_a_mirror(rock):
         face_normals(rock.mesh.verts_obj, rock.mesh.faces) * flip,
         atol=1e-12,
     )
-    for watertight in (image.watertight, *image.watertight.parts):
-        assert trimesh.Trimesh(watertight.verts_obj, watertight.faces, process=False).volume > 0
+    surfaces = [(shape.verts_obj, shape.faces) for shape in image.watertight.parts]
+    for verts, faces in [(image.watertight.verts_obj, image.watertight.faces), *surfaces]:
+        assert trimesh.Trimesh(verts, faces, process=False).volume > 0
     face = np.arange(len(rock.mesh.faces))
     weights = np.tile([0.7, 0.2, 0.1], (len(face), 1))
     np.testing.assert_allclose(

@@ -80,7 +80,7 @@ def test_equal_meshes_give_equal_bytes(painted_box):
 
 
 def test_trimesh_reads_the_file_too(painted_box):
-    scene = trimesh.load(io.BytesIO(mesh_to_glb(painted_box)), file_type="glb")
+    scene = trimesh.load_scene(io.BytesIO(mesh_to_glb(painted_box)), file_type="glb")
     np.testing.assert_allclose(scene.extents, [0.10, 0.06, 0.08], rtol=1e-6)
     assert len(scene.geometry) == 3
 

@@ -80,7 +80,7 @@ def test_mtl_becomes_plausible_materials(tmp_path):
     assert glass.roughness < 0.1
     assert chrome.metallic == 1
     assert cloth.base_color_image == png()
-    assert cloth.base_color_rgba == (1, 1, 1, 1)
+    assert cloth.base_color_rgba == (1.0, 1.0, 1.0, 1.0)
     assert cloth.roughness > 0.6
 
 

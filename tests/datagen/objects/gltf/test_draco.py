@@ -4,6 +4,7 @@ import io
 import json
 import struct
 from pathlib import Path
+from typing import Any
 
 import DracoPy
 import numpy as np
@@ -46,7 +47,7 @@ def packed_twin(plain: bytes) -> bytes:
         binary += data + b"\0" * (-len(data) % 4)
         return len(views) - 1
 
-    accessors = []
+    accessors: list[dict[str, Any]] = []
     for k in range(len(document.get("images", []))):
         data = file.image(k)
         document["images"][k]["bufferView"] = view(data)
@@ -102,7 +103,7 @@ def test_draco_colours_are_normalised_as_the_accessor_says(tmp_path):
     colors = np.array([[255, 0, 0, 255]] * 3, dtype=np.uint8)
     data = DracoPy.encode(points, np.array([[0, 1, 2]], dtype=np.uint32), colors=colors)
     ids = {a["attribute_type"]: a["unique_id"] for a in DracoPy.decode(data).attributes}
-    document = {
+    document: dict[str, Any] = {
         "nodes": [{"mesh": 0}],
         "meshes": [
             {
@@ -128,7 +129,9 @@ def test_draco_colours_are_normalised_as_the_accessor_says(tmp_path):
     }
     (tmp_path / "a.glb").write_bytes(glb_bytes(document, data))
     mesh = read_object(tmp_path / "a.glb", CONFIG).mesh
-    image = np.asarray(Image.open(io.BytesIO(mesh.materials[0].base_color_image)))
+    texture = mesh.materials[0].base_color_image
+    assert texture is not None
+    image = np.asarray(Image.open(io.BytesIO(texture)))
     assert (image.reshape(-1, 3).max(axis=0) == [255, 0, 0]).all()
     document["meshes"][0]["primitives"][0]["extensions"]["KHR_draco_mesh_compression"]["attributes"][
         "COLOR_0"
@@ -253,7 +256,7 @@ def test_specular_gloss_image_tells_metal_from_paint(tmp_path):
     assert (read.metallic, read.roughness) == (1, 1)
 
 
-BAD = {
+BAD: dict[str, tuple[dict[str, Any], str]] = {
     "meshopt": ({"extensionsRequired": ["EXT_meshopt_compression"]}, "requires EXT_meshopt_compression"),
     "basisu": (
         {

@@ -5,6 +5,7 @@ import io
 import json
 import struct
 from copy import deepcopy
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,7 +61,7 @@ def glb_bytes(document: dict, binary: bytes = BINARY) -> bytes:
 def changed(*steps, value) -> dict:
     """DOCUMENT with the value at `steps` replaced."""
     document = deepcopy(DOCUMENT)
-    place = document
+    place: Any = document
     for step in steps[:-1]:
         place = place[step]
     place[steps[-1]] = value

@@ -14,7 +14,7 @@ from datagen.objects.mesh.surface_points import face_areas, face_normals
 
 
 def signed_volume(mesh) -> float:
-    return trimesh.Trimesh(mesh.verts_obj, mesh.faces, process=False).volume
+    return float(trimesh.Trimesh(mesh.verts_obj, mesh.faces, process=False).volume)
 
 
 @pytest.mark.parametrize("turned", ["all", "some", "none"])

@@ -32,8 +32,8 @@ def test_what_is_on_disk_is_listed(opened, root):
     store = opened(root)
     assert isinstance(store, ObjectLibrary)
     assert store.uids() == tuple(sorted(f"objaverse/{objaverse_id(name)}" for name in MODELS))
-    assert store.holds(f"objaverse/{BREAD}")
-    assert not store.holds("objaverse/" + "0" * 32)
+    assert opened(root).holds(f"objaverse/{BREAD}")
+    assert not opened(root).holds("objaverse/" + "0" * 32)
 
 
 def test_model_is_scaled_to_what_a_hand_holds(opened, root):

@@ -94,11 +94,12 @@ def test_hollow_shell_is_filled(watertight_config):
 
 def test_signed_distance_of_a_box_is_exact(box):
     rng = np.random.default_rng(0)
+    verts, faces = box
     points = rng.uniform(-0.09, 0.09, (2000, 3))
     outside = np.maximum(np.abs(points) - [0.05, 0.04, 0.03], 0.0)
     within = np.minimum((np.abs(points) - [0.05, 0.04, 0.03]).max(axis=1), 0.0)
     expected = np.linalg.norm(outside, axis=1) + within
-    np.testing.assert_allclose(signed_distance(*box, points), expected, atol=1e-12)
+    np.testing.assert_allclose(signed_distance(verts, faces, points), expected, atol=1e-12)
 
 
 def test_decimation_keeps_a_ball_closed():

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -25,9 +26,9 @@ class _LargestTensor(TorchDispatchMode):
     bytes = 0
 
     def __torch_dispatch__(
-        self, func: object, types: object, args: tuple = (), kwargs: object = None
+        self, func: Callable[..., Any], types: object, args: tuple = (), kwargs: dict[str, Any] | None = None
     ) -> object:
-        out = func(*args, **(kwargs or {}))  # type: ignore[operator]
+        out = func(*args, **(kwargs or {}))
         for tensor in out if isinstance(out, tuple | list) else [out]:
             if isinstance(tensor, Tensor):
                 self.bytes = max(self.bytes, tensor.untyped_storage().nbytes())

@@ -22,11 +22,6 @@ from model.networks.sparse.tensor import SparseTensor
 _WINDOWS = [None, Window(size=4, shift=0), Window(size=4, shift=2), Window(size=3, shift=1)]
 
 
-@pytest.fixture(autouse=True)
-def _seed() -> None:
-    torch.manual_seed(0)
-
-
 def _tensor(fraction: float, channels: int = 12) -> SparseTensor:
     occupancy = torch.rand(2, 8, 8, 8) < fraction
     return SparseTensor.from_dense(torch.randn(2, channels, 8, 8, 8), occupancy)
@@ -64,7 +59,7 @@ def test_self_attention_is_masked_attention(fraction: float, window: Window | No
     torch.testing.assert_close(grads[1:], expected[1:], atol=1e-4, rtol=1e-4)
 
 
-def test_full_grids_are_the_dense_layers() -> None:
+def test_full_grids_are_the_dense_self_attention() -> None:
     """With the same parameters, by the same names."""
     x = _tensor(1.0)
     tokens = x.features.unflatten(0, (2, -1))
@@ -72,6 +67,10 @@ def test_full_grids_are_the_dense_layers() -> None:
     sparse.load_state_dict(dense.state_dict())
     torch.testing.assert_close(sparse(x).features, dense(tokens).flatten(0, 1), atol=1e-5, rtol=1e-5)
 
+
+def test_full_grids_are_the_dense_cross_attention() -> None:
+    x = _tensor(1.0)
+    tokens = x.features.unflatten(0, (2, -1))
     sparse, dense = SparseCrossAttention(12, 7, 3), CrossAttention(12, 7, 3)
     sparse.load_state_dict(dense.state_dict())
     contexts, weights = torch.randn(2, 4, 6, 7), torch.rand(2, 4).softmax(-1)

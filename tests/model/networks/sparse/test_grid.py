@@ -33,7 +33,7 @@ def _rows(grid: SparseGrid) -> list[tuple[int, ...]]:
     return [(int(b), *map(int, p)) for b, p in zip(grid.batch_index, grid.coordinates, strict=True)]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(occupancies)
 def test_dense_and_back(occupancy: torch.Tensor) -> None:
     dense = torch.randn(len(occupancy), 2, *occupancy.shape[1:]) * occupancy[:, None]
@@ -44,7 +44,7 @@ def test_dense_and_back(occupancy: torch.Tensor) -> None:
     assert _rows(x.grid) == sorted(_rows(x.grid))
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(occupancies, st.randoms(use_true_random=False))
 def test_any_order_of_input_gives_the_same_tensor(occupancy: torch.Tensor, random: object) -> None:
     x = SparseTensor.from_dense(torch.randn(len(occupancy), 3, *occupancy.shape[1:]), occupancy)
@@ -113,7 +113,7 @@ def test_other_bad_input_is_refused() -> None:
         Window(size=4, shift=4)
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(occupancies, st.sampled_from([1, 3, 5]))
 def test_neighbours_are_the_voxels_at_each_offset(occupancy: torch.Tensor, kernel: int) -> None:
     grid = SparseGrid.from_occupancy(occupancy)
@@ -136,7 +136,7 @@ def test_neighbours_are_the_voxels_at_each_offset(occupancy: torch.Tensor, kerne
     assert found == expected
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(occupancies, st.integers(1, 4), st.data())
 def test_windows_part_the_rows(occupancy: torch.Tensor, size: int, data: st.DataObject) -> None:
     shift = data.draw(st.integers(0, size - 1))
@@ -156,7 +156,7 @@ def test_windows_part_the_rows(occupancy: torch.Tensor, size: int, data: st.Data
     assert len(padded.row_of_place) <= 1.25 * grid.voxels
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(occupancies)
 def test_coarser_and_finer_grids(occupancy: torch.Tensor) -> None:
     grid = SparseGrid.from_occupancy(occupancy)

@@ -37,7 +37,9 @@ T_OBJ_FROM_CANONICAL[:3, 3] = CENTER_OBJ
 
 
 def as_glb(shape: trimesh.Trimesh | trimesh.Scene) -> bytes:
-    return bytes(shape.export(file_type="glb"))
+    exported = shape.export(file_type="glb")
+    assert isinstance(exported, bytes)
+    return exported
 
 
 def expected_image(view: ObjectView, *, mirror: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
@@ -102,8 +104,10 @@ def test_colours_of_parts_are_kept_apart() -> None:
     mesh = textured_mesh(as_glb(scene), np.diag([2.0, 2, 2, 1]), where="parts")
     up = mesh.vertices[:, 2] > 0.2  # glTF's Y is up; half the size in canonical units
     np.testing.assert_allclose(mesh.vertices[up].mean(0), [0, 0, 0.5], atol=1e-6)
-    np.testing.assert_array_equal(mesh.colors[up], np.tile(np.float32([1, 0, 0]), (up.sum(), 1)))
-    np.testing.assert_array_equal(mesh.colors[~up], np.tile(np.float32([0, 1, 0]), ((~up).sum(), 1)))
+    np.testing.assert_array_equal(mesh.colors[up], np.tile(np.array([1, 0, 0], np.float32), (up.sum(), 1)))
+    np.testing.assert_array_equal(
+        mesh.colors[~up], np.tile(np.array([0, 1, 0], np.float32), ((~up).sum(), 1))
+    )
 
 
 def test_cameras_look_at_the_object_from_all_sides() -> None:

@@ -77,7 +77,7 @@ def test_an_object_without_points_is_refused():
         object_features(bare, np.zeros((1, 3), int), RESOLUTION)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 1000))
 def test_the_mirrored_object_has_the_mirrored_distances(seed):
     surface = plate((0.4, 0.2, 0.1), count=2000, seed=seed)

@@ -46,7 +46,9 @@ def ball_glb(*, texture_px: int = 256, steps: int = 64) -> bytes:
         ),
         process=False,
     )
-    return bytes(mesh.export(file_type="glb", include_normals=True))
+    exported = mesh.export(file_type="glb", include_normals=True)
+    assert isinstance(exported, bytes)
+    return exported
 
 
 def _directions(u: np.ndarray, v: np.ndarray) -> np.ndarray:

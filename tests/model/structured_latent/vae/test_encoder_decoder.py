@@ -34,7 +34,7 @@ def _features(out: Any) -> Tensor:
     return torch.cat([out.mean.features, out.logvar.features], dim=1)
 
 
-def _dense_trunk(network: nn.Module, x: SparseTensor, config: SlatVaeConfig) -> Tensor:
+def _dense_trunk(network: Any, x: SparseTensor, config: SlatVaeConfig) -> Tensor:
     """The trunk for one sample as attention among all voxels, masked to those of the same window."""
     coordinates, channels = x.grid.coordinates, config.channels
     table = sincos_position_embedding(config.resolution, 3, channels).view(*[config.resolution] * 3, channels)
@@ -118,7 +118,7 @@ def test_heads_start_small_and_let_the_gradient_through(
     out = _features(network(x))
     assert 0 < out.square().mean().sqrt() < 0.5
     out.square().mean().backward()
-    assert network.input_layer.weight.grad.any()
+    assert network.get_parameter("input_layer.weight").grad.any()
 
 
 @pytest.mark.parametrize(("build", "channels"), NETWORKS)

@@ -80,6 +80,7 @@ def test_an_inside_out_field_is_pulled_back_everywhere():
     features = (-5 * decoded.features).requires_grad_()
     loss = measured(decoded.with_features(features), x, 0.3)
     loss.corner.sum().backward()
+    assert features.grad is not None
     with torch.no_grad():
         away = decoded.features[:, :8].abs() > 0.2
         towards = -features.grad[:, :8].sign() == decoded.features[:, :8].sign()
