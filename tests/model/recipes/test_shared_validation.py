@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from shards.splits import Split
 from tests.model.data.balls import write_balls
 from tests.model.inference.small_networks import small_stage_two
 from tests.model.small_run import ROOT, forehoi, small_settings, write_config
@@ -39,7 +40,8 @@ def settings_of(stage: int, dataset: Path) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", [1, 2])
 def test_two_processes_give_the_metrics_of_one(stage, tmp_path):
-    dataset = write_balls(tmp_path / "balls", splits=[["train"] * 2 + ["val"] * OBJECTS])
+    splits: list[Split] = ["train", "train", *["val"] * OBJECTS]
+    dataset = write_balls(tmp_path / "balls", splits=[splits])
     config = write_config(tmp_path / "config.yaml", settings_of(stage, dataset))
     status, output = forehoi("train", config, "--out", tmp_path / "one")
     assert status == 0, output
