@@ -9,7 +9,6 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from model.networks.lora import import_adapter
 from model.recipes.config import load_config
 from model.recipes.stage_one_config import StageOneTrainingConfig
 from model.sparse_structure.geometry_branch import GeometryBranch
@@ -17,6 +16,7 @@ from model.sparse_structure.stage_one import StageOneTask
 from model.weights.weight_file import write_weight_file
 from shards.schema import ObjectRow
 from tests.model.data.balls import write_balls
+from tests.model.networks.adapters import read_by_peft
 from tests.model.small_run import fails, forehoi, small_settings, write_config
 from tests.model.stages import stage_one
 from tests.model.weights.published import write_published
@@ -199,8 +199,7 @@ def test_an_exported_adapter_is_that_of_the_averages_and_peft_reads_it(place, tm
     status, output = forehoi("weights", "export-adapter", place / "run", "--out", tmp_path / "adapter")
     assert status == 0, output
     task = loaded(place, place / "run")
-    plain = GeometryBranch(config_of(place).stage_one.network.geometry)
-    import_adapter(plain, tmp_path / "adapter")
+    plain = read_by_peft(GeometryBranch(config_of(place).stage_one.network.geometry), tmp_path / "adapter")
     expected = dict(task.network.flow.geometry.named_parameters())
     found = {name: p for name, p in plain.named_parameters() if p.requires_grad}
     assert len(found) == 20

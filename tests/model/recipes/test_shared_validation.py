@@ -40,7 +40,8 @@ def settings_of(stage: int, dataset: Path) -> dict[str, Any]:
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", [1, 2])
 def test_two_processes_give_the_metrics_of_one(stage, tmp_path):
-    splits: list[Split] = ["train", "train", *["val"] * OBJECTS]
+    held_out: list[Split] = ["val"] * OBJECTS
+    splits: list[Split] = ["train", "train", *held_out]
     dataset = write_balls(tmp_path / "balls", splits=[splits])
     config = write_config(tmp_path / "config.yaml", settings_of(stage, dataset))
     status, output = forehoi("train", config, "--out", tmp_path / "one")

@@ -30,6 +30,7 @@ from model.surface.fields import CHANNELS, CORNERS
 from model.training.step_generators import sample_generators
 from model.training.task import Measurements, Task, merged
 from tests.model.encoders.mean_color import MeanColor
+from tests.model.networks.sparse.dense import from_samples, occupancy_of
 from tests.model.structured_latent.watertight_shapes import (
     ball,
     ball_distance,
@@ -175,7 +176,7 @@ def test_prediction_is_repeatable_and_lies_on_the_given_voxels(flow_task, batch)
         flow_task.predict(batch.images, batch.occupancy, torch.Generator().manual_seed(3)) for _ in range(2)
     )
     torch.testing.assert_close(a.decoded.features, b.decoded.features, rtol=0, atol=0)
-    assert torch.equal(a.latent.grid.occupancy(), batch.occupancy)
+    assert torch.equal(occupancy_of(a.latent.grid), batch.occupancy)
     fields = a.fields(1)
     assert len(fields.voxels) == int(batch.occupancy[1].sum())
 
@@ -240,7 +241,7 @@ def test_a_pierced_surface_shows_in_its_handles(batch):
     truth = object_surface(batch.true_surface, 0)
 
     def metrics(channels: torch.Tensor) -> dict[str, float]:
-        decoded = SparseTensor.from_samples([channels], [voxels], 64)
+        decoded = from_samples([channels], [voxels], 64)
         return means_of(decoded, truth)
 
     clean = metrics(channels)
