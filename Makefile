@@ -91,11 +91,11 @@ train: $(TRAIN) ## train the preset tiny on shard 0 of DATA, rendering it if abs
 	@test -f $(DATA)/shards/shard-00000/shard.json || $(MAKE) --no-print-directory render SHARD=0 OUT=$(DATA)
 	$(VENV)/bin/forehoi train tiny $(ARGS)
 
-# figures.json of a part is written when its training is finished; a stopped one is continued.
+# metrics.json of a component is written when its training is finished; a stopped one is resumed.
 demo: $(TRAIN) ## train both stages of tiny unless that is done, then reconstruct a held-out clip into runs/demo
-	@test -f $(DATA)/shards/shard-00000/shard.json -a -f runs/tiny/stage_one/figures.json || \
+	@test -f $(DATA)/shards/shard-00000/shard.json -a -f runs/tiny/stage_one/metrics.json || \
 		$(MAKE) --no-print-directory train ARGS=
-	@test -f runs/tiny_slat/slat_flow/figures.json || { set -x; $(VENV)/bin/forehoi train tiny_slat; }
+	@test -f runs/tiny_slat/slat_flow/metrics.json || { set -x; $(VENV)/bin/forehoi train tiny_slat; }
 	$(VENV)/bin/forehoi reconstruct --held-out --out runs/demo --overwrite $(ARGS)
 
 test: $(DEV) ## run the tests, without those marked slow

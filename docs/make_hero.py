@@ -1,7 +1,7 @@
 """Make docs/hero.jpg out of a dataset: what a shard holds of some frames, one column each.
 
 From top to bottom: image; masks, with the part of the object that is hidden; depth; normals; the object's own mesh. The
-picture in the README is made of docs/hero.yaml:
+image in the README is made of docs/hero.yaml:
 
     for shard in 0 1 3 5 7 12 14 15; do datagen render --config docs/hero.yaml --out data/hero --shard $shard; done
     python docs/make_hero.py data/hero docs/hero.jpg
@@ -103,14 +103,14 @@ def main() -> None:
     arguments = parser.parse_args()
     dataset = open_dataset(arguments.dataset)
     pitch = TILE_PX + GAP_PX
-    picture = Image.new("RGB", (len(COLUMNS) * pitch - GAP_PX, len(ROWS) * pitch - GAP_PX), "black")
+    sheet = Image.new("RGB", (len(COLUMNS) * pitch - GAP_PX, len(ROWS) * pitch - GAP_PX), "black")
     for x, (clip_id, frame, camera) in enumerate(COLUMNS):
         for y, tile in enumerate(column(dataset, clip_id, frame, camera)):
-            picture.paste(Image.fromarray(tile), (x * pitch, y * pitch))
-    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(17)
+            sheet.paste(Image.fromarray(tile), (x * pitch, y * pitch))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(17)
     for y, label in enumerate(ROWS):
         draw.text((8, y * pitch + 5), label, fill="white", font=font, stroke_width=2, stroke_fill="black")
-    picture.save(arguments.out, quality=88, optimize=True)
+    sheet.save(arguments.out, quality=88, optimize=True)
 
 
 if __name__ == "__main__":

@@ -31,16 +31,21 @@ class CameraReport:
 def frustum_report(scene: Scene) -> tuple[CameraReport, ...]:
     """Margin of every hand-model and object vertex in every frame, and drift of the object, per camera."""
     hand = scene.hand_verts_world[:, : scene.hand_surface.n_hand_verts]
-    verts_obj = scene.object_mesh.verts_obj
-    obj = transform_points(scene.T_world_from_obj, np.broadcast_to(verts_obj, (len(hand), *verts_obj.shape)))
-    points = np.concatenate([hand, obj], axis=1)
+    margins_px = [np.inf] * len(scene.cameras)
+    for frame, T_world_from_obj in enumerate(scene.T_world_from_obj):  # one at a time: meshes may be large
+        obj = transform_points(T_world_from_obj, scene.object_mesh.verts_obj)
+        points = np.concatenate([hand[frame], obj])[None]
+        for number, camera in enumerate(scene.cameras):
+            T_cam_from_world = camera.T_cam_from_world[frame : frame + 1]
+            margin_px = image_margin_px(points, camera.K, T_cam_from_world, camera.image_size)
+            margins_px[number] = min(margins_px[number], margin_px)
     center = _object_center_world(scene)
     return tuple(
         CameraReport(
-            min_margin_px=image_margin_px(points, camera.K, camera.T_cam_from_world, camera.image_size),
+            min_margin_px=margin_px,
             object_drift_px=image_drift_px(center, camera.K, camera.T_cam_from_world),
         )
-        for camera in scene.cameras
+        for camera, margin_px in zip(scene.cameras, margins_px)
     )
 
 

@@ -14,6 +14,7 @@ import torch
 
 from model.inference.networks import load_networks, open_stage_one, open_stage_two
 from model.inference.reconstruction import STANDARD, reconstruct
+from model.inference.stage_clock import StageClock
 from model.surface.export import glb_bytes
 from model.video.frames import ReadLimits
 from model.video.reading import read_informative_frames
@@ -34,9 +35,10 @@ def main() -> None:
     frames, _ = read_informative_frames(arguments.source, arguments.frames, candidates, max_side_px=2048)
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     networks = load_networks(open_stage_one(arguments.stage_one), open_stage_two(arguments.stage_two), device)
-    result = reconstruct(frames, networks, STANDARD)
+    clock = StageClock()
+    result = reconstruct(frames, networks, STANDARD, clock=clock)
     print(f"frames {list(result.frames.indices)}: {len(result.voxels)} voxels")
-    for stage, seconds in result.seconds.items():
+    for stage, seconds in clock.seconds.items():
         print(f"{stage}: {seconds:.1f} s")
     for note in result.notes:
         print(f"note: {note}")

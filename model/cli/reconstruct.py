@@ -76,7 +76,7 @@ class _Request:
     help="Number of frames to choose.  [default: as stage 1 was validated with]",
 )
 @click.option(
-    "--box", help="x0,y0,x1,y1 in pixels around hand and object in every frame.  [default: searched]"
+    "--box", help="x0,y0,x1,y1 in pixels around hand and object in every frame.  [default: detected]"
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of the noise.")
 @click.option("--held-out", is_flag=True, help="Take as INPUT a clip that the training of stage 1 never saw.")

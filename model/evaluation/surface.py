@@ -1,4 +1,4 @@
-"""Distance and F-score between a found mesh and the true surface of an object, in the object's own frame.
+"""Distance and F-score between a predicted mesh and the true surface of an object, in the object's own frame.
 
 Protocol: both in the canonical frame, scaled to metres by `object_scale_m`; no alignment of any kind (the frames are
 the same). The mesh is sampled evenly by area with a generator of its own; the truth are the `surface_points` of the

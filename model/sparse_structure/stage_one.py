@@ -106,7 +106,7 @@ class StageOneTask:
     hand_encoder: FeatureEncoder
     vae: StructureVae  # frozen
     config: StageOneConfig
-    mean_shape: Bool[Tensor, "64 64 64"]  # of the training objects: what a prediction has to beat
+    mean_shape: Bool[Tensor, "64 64 64"]  # of the training objects: the baseline
 
     @property
     def module(self) -> nn.Module:

@@ -1,4 +1,4 @@
-"""True surfaces beside found meshes, from the same camera."""
+"""True surfaces beside predicted meshes, from the same camera."""
 
 from collections.abc import Sequence
 

@@ -49,7 +49,7 @@ __all__ = [
 
 
 class NonFiniteLossError(RuntimeError):
-    """The loss became NaN or infinite; the message names motions, clips and frames, and where training can go on."""
+    """The loss became NaN or infinite; the message names motions, clips and frames, and where training can resume."""
 
 
 class TrainingStopped(Exception):  # noqa: N818  (no error: the run was asked to stop and is saved)
@@ -72,7 +72,7 @@ class BatchSource(Protocol):
 
     @property
     def data_sha256(self) -> str:
-        """Digest of what is read: a run goes on with the same data only."""
+        """Digest of what is read: a run resumes with the same data only."""
 
     def batches(self, epoch: int, samples_consumed: int) -> Generator[PlacedBatch, None, None]:
         """Batches of this rank from there on; epochs follow each other. Closing it ends what loads them."""

@@ -16,9 +16,9 @@ from shards.geometry import (
     transform_points,
     unproject_depth,
 )
+from tests.datagen.scene.boxes import OBJECT_HALF_M
 
 OBJECT, HAND, ARM, TABLE = 1, 2, 3, 4
-OBJECT_HALF_M = np.array([0.05, 0.03, 0.08])
 
 
 @pytest.fixture(scope="module")

@@ -6,12 +6,14 @@ import dataclasses
 import numpy as np
 import pytest
 
+from datagen.scene.scene import Scene
 from datagen.scene.scene_file import SceneFileError, load_scene, save_scene, scene_sha256
+from tests.datagen.scene.boxes import made_box_scene
 
 
-@pytest.fixture
-def scene(box_scene):
-    return box_scene
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return made_box_scene()
 
 
 def assert_same(a, b):

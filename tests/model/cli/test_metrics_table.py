@@ -1,4 +1,4 @@
-"""The table shows a metric beside what it has to beat, and only there."""
+"""The table shows a metric next to its baseline, and only there."""
 
 import math
 
@@ -34,7 +34,7 @@ def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
     assert "mean training shape" in shape
     (found,) = [index for index, line in enumerate(lines) if "0.710" in line]
     assert "0.680" in lines[found]
-    assert "as the hand encoder finds it" in lines[found]
+    assert "as the hand encoder detects it" in lines[found]
     assert "0.870" in lines[found + 1]
     assert "the true one" in lines[found + 1]
     (occluded,) = [line for line in lines if "0.500" in line]
@@ -42,7 +42,7 @@ def test_a_baseline_is_a_column_and_no_row_of_its_own() -> None:
     assert "nan" not in capture.get()
 
 
-def test_stage_two_has_the_mean_latent_to_beat() -> None:
+def test_the_baseline_of_stage_two_is_the_mean_latent() -> None:
     console = Console(width=120)
     with console.capture() as capture:
         console.print(

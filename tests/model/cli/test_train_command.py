@@ -140,7 +140,7 @@ def test_missing_unknown_and_contradicting_keys(dataset, tmp_path):
         assert text.count(old) == 1, old
         path.write_text(text.replace(old, new))
         assert expected in fails("train", path, "--out", tmp_path / "run")
-    assert "does not exist" in fails("train", tmp_path / "none.yaml")
+    assert "no such configuration" in fails("train", tmp_path / "none.yaml")
     assert not (tmp_path / "run").exists()
 
 

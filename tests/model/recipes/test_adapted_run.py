@@ -1,6 +1,7 @@
 """Stage 1 from imported weights with adapters: what is trained, exact resume, merging, export, what does not fit."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,13 +9,14 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from model.networks.lora import import_adapter
 from model.recipes.config import load_config
 from model.recipes.stage_one_config import StageOneTrainingConfig
 from model.sparse_structure.geometry_branch import GeometryBranch
 from model.sparse_structure.stage_one import StageOneTask
 from model.weights.weight_file import write_weight_file
+from shards.schema import ObjectRow
 from tests.model.data.balls import write_balls
+from tests.model.networks.adapters import read_by_peft
 from tests.model.small_run import fails, forehoi, small_settings, write_config
 from tests.model.stages import stage_one
 from tests.model.weights.published import write_published
@@ -197,12 +199,52 @@ def test_an_exported_adapter_is_that_of_the_averages_and_peft_reads_it(place, tm
     status, output = forehoi("weights", "export-adapter", place / "run", "--out", tmp_path / "adapter")
     assert status == 0, output
     task = loaded(place, place / "run")
-    plain = GeometryBranch(config_of(place).stage_one.network.geometry)
-    import_adapter(plain, tmp_path / "adapter")
+    plain = read_by_peft(GeometryBranch(config_of(place).stage_one.network.geometry), tmp_path / "adapter")
     expected = dict(task.network.flow.geometry.named_parameters())
     found = {name: p for name, p in plain.named_parameters() if p.requires_grad}
     assert len(found) == 20
     assert all(torch.equal(parameter, expected[name]) for name, parameter in found.items())
+
+
+@pytest.mark.parametrize(
+    ("change", "first"),
+    [
+        ({"flow.geometry.surplus": torch.zeros(2)}, "geometry.surplus"),
+        ({"flow.masks.input_layer.bias": None}, "masks.input_layer.bias"),
+    ],
+)
+def test_a_checkpoint_that_is_not_of_its_configuration_is_not_merged(place, tmp_path, change, first):
+    """As one of another version of the package may be: tensors that the flow has none of, or the other way round."""
+    run = Path(shutil.copytree(place / "run", tmp_path / "run"))
+    for name in ("weights", "average"):
+        path = checkpoint(run, 4) / f"{name}.safetensors"
+        tensors = load_file(path) | change
+        save_file({key: tensor for key, tensor in tensors.items() if tensor is not None}, path)
+    line = fails("weights", "merge", run, "--out", tmp_path / "merged.safetensors")
+    assert f"step-00000004: does not fit its own configuration, first {first};" in line
+    assert not (tmp_path / "merged.safetensors").exists()
+
+
+def test_what_a_stopped_run_measured_of_other_data_is_not_used(place, tmp_path):
+    """With imported weights below it, nothing but the statistics is of the data before the first checkpoint."""
+    settings = yaml.safe_load((place / "config.yaml").read_text()) | {"hand_encoder": None}
+    settings["encoders"]["hand"] = {"packaged_grid": 8}
+    settings["stage_one"]["recipe"]["trainer"]["steps"] = 1
+    others = write_balls(tmp_path / "others", change_object=with_half_of_its_voxels)
+    filled = {}
+    for data in (place / "balls", others):
+        settings["data"]["datasets"] = [str(data)]
+        config = write_config(tmp_path / "config.yaml", settings)
+        status, output = forehoi("train", config, "--out", tmp_path / "run")
+        assert status == 0, output
+        folder = tmp_path / "run" / "stage_one"
+        filled[data] = int(load_file(folder / "dataset_statistics.safetensors")["mean_shape"].sum())
+        shutil.rmtree(folder / "checkpoints")  # as if stopped before the first one
+    assert 0 < filled[others] < 0.6 * filled[place / "balls"]
+
+
+def with_half_of_its_voxels(row: ObjectRow) -> ObjectRow:
+    return replace(row, occupancy_64=row.occupancy_64[: len(row.occupancy_64) // 2])
 
 
 def test_what_does_not_fit_is_one_line(place, tmp_path):

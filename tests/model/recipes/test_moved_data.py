@@ -1,4 +1,4 @@
-"""A run goes on wherever its data lie and is used where they are not; other data are refused."""
+"""A run resumes wherever its data lie and is used where they are not; other data are refused."""
 
 import json
 import shutil

@@ -21,6 +21,7 @@ from model.recipes.train_component import train_component
 from model.structured_latent.flow import SlatFlow
 from model.structured_latent.vae.latent import LatentNormalisation
 from model.training.checkpoint import latest_checkpoint
+from model.training.trainer import StepReport, TrainingEvent
 from model.weights.slat import SLAT_FLOW
 from model.weights.weight_file import write_weight_file
 from shards.settings import SettingsError
@@ -71,15 +72,15 @@ def component_of(config: StageTwoTrainingConfig, name: str) -> Component:
 
 
 def train(name: str, config: StageTwoTrainingConfig, folder: Path) -> tuple[dict[str, float], list[int]]:
-    steps: list[int] = []
+    events: list[TrainingEvent] = []
     metrics = train_component(
         component_of(config, name),
         config,
         folder,
         accelerator=Accelerator(cpu=True),
-        report=lambda report: steps.append(report.step),
+        report=events.append,
     )
-    return metrics, steps
+    return metrics, [event.step for event in events if isinstance(event, StepReport)]
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ from accelerate import Accelerator
 from model.recipes.config import parse_config, read_settings
 from model.recipes.stage_two_config import StageTwoTrainingConfig
 from model.recipes.train_component import train_component
+from model.training.trainer import StepReport, TrainingEvent
 from tests.model.stages import stage_two
 from tests.model.structured_latent.object_features.textured_ball import write_textured_balls
 
@@ -46,16 +47,16 @@ def small_config(dataset: Path, cache: Path | None) -> StageTwoTrainingConfig:
 
 def trained(name: str, config: StageTwoTrainingConfig, folder: Path) -> list[float]:
     """Losses of its steps."""
-    losses: list[float] = []
+    events: list[TrainingEvent] = []
     (component,) = (component for component in config.components() if component.name == name)
     train_component(
         component,
         config,
         folder,
         accelerator=Accelerator(cpu=True),
-        report=lambda report: losses.append(report.losses["loss"]),
+        report=events.append,
     )
-    return losses
+    return [event.losses["loss"] for event in events if isinstance(event, StepReport)]
 
 
 @pytest.fixture(scope="module")

@@ -315,7 +315,7 @@ def test_a_half_written_checkpoint_does_not_count(tmp_path):
 def test_what_a_killed_process_left_half_written_is_deleted_and_nothing_else(tmp_path):
     folder = tmp_path / "checkpoints"
     others = [folder / "notes", folder / ".step-1.partial", tmp_path / ".step-00000099.partial"]
-    for steps in (4, 8):  # a run that begins, a run that goes on
+    for steps in (4, 8):  # a run that begins, a run that resumes
         for path in (folder / ".step-00000099.partial", *others):
             path.mkdir(parents=True, exist_ok=True)
             (path / "weights.safetensors").write_bytes(b"half")

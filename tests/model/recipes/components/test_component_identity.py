@@ -1,4 +1,4 @@
-"""A run goes on under other loading and bookkeeping, and under nothing else."""
+"""A run resumes under other loading and bookkeeping, and under nothing else."""
 
 from dataclasses import replace
 from pathlib import Path
