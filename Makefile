@@ -22,11 +22,12 @@ PIP     := PYTHONWARNINGS=ignore $(VENV)/bin/python -m pip install --quiet --dis
 RUNTIME := $(VENV)/.runtime-installed
 DEV     := $(VENV)/.dev-installed
 TRAIN   := $(VENV)/.training-installed
+SHARDS  := .venv-shards/.installed
 
-.PHONY: help setup render train demo test test-slow check bench clean
+.PHONY: help setup render train demo test test-shards test-parity test-slow check bench clean
 
 help: ## list the targets and their variables
-	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 12
+	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 14
 	@echo
 	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) ARGS=$(ARGS) PYTHON=$(PYTHON)"
 	@echo "places of licensed inputs: GRASPXL=$(GRASPXL) OBJAVERSE=$(OBJAVERSE) MANO_DIR=$(MANO_DIR) HTML_DIR=$(HTML_DIR)"
@@ -81,6 +82,19 @@ demo: $(TRAIN) ## train both stages of tiny unless that is done, then reconstruc
 test: $(DEV) ## run the tests, without those marked slow
 	$(VENV)/bin/python -m pytest -q -m "not slow" $(ARGS)
 
+$(SHARDS): pyproject.toml
+	@echo "creating .venv-shards: the format and its tests, without Blender and PyTorch"
+	@$(PYTHON) -m venv .venv-shards
+	@.venv-shards/bin/python -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable '.[shards-tests]'
+	@touch $@
+
+test-shards: $(SHARDS) ## run the tests of the format alone, without Blender and PyTorch
+	.venv-shards/bin/python -m pytest -q -m "not slow" tests/shards $(ARGS)
+
+test-parity: $(DEV) ## install the public packages that results are compared with, then compare
+	@$(PIP) --editable '.[datagen,model,dev,parity]'
+	$(VENV)/bin/python -m pytest -q -m parity $(ARGS)
+
 test-slow: $(DEV) ## run the tests that take minutes
 	$(VENV)/bin/python -m pytest -q -m slow $(ARGS)
 
@@ -95,5 +109,5 @@ bench: $(DEV) ## measure the performance claims of README.md on this machine
 	$(VENV)/bin/python -m pytest -q -s tests/benchmarks --override-ini "python_files=bench_*.py" --override-ini addopts=--import-mode=importlib $(ARGS)
 
 clean: ## remove .venv and caches; rendered data stays
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks *.egg-info
+	rm -rf $(VENV) .venv-shards .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis .benchmarks *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

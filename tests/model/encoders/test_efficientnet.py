@@ -26,8 +26,9 @@ def encoder() -> EfficientNetEncoder:
 
 def photograph(name: str) -> torch.Tensor:
     """The central square of a photograph of scikit-image at 224 px."""
-    skimage = pytest.importorskip("skimage")
-    io = pytest.importorskip("skimage.io")
+    import skimage
+    from skimage import io
+
     image = io.imread(Path(skimage.__file__).parent / "data" / name)[..., :3]
     side = min(image.shape[:2])
     top, left = (image.shape[0] - side) // 2, (image.shape[1] - side) // 2

@@ -12,7 +12,8 @@ from shards.reader import open_dataset
 from shards.storage.frame_pages import local_pages
 from shards.storage.images import encode_rgb_png
 from shards.storage.parquet import ParquetSource
-from tests.model.data.balls import write_balls
+from shards.writer import begin_dataset, commit_shard
+from tests.shards.synthetic import PROVENANCE, dataset_record, stage_synthetic
 
 COLUMNS = ("rgb", "masks")
 
@@ -26,7 +27,9 @@ def noisy(frame):
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> ParquetSource:
     root = tmp_path_factory.mktemp("pages") / "data"
-    write_balls(root, splits=[["train"]], cameras=2, n_frames=3, change_frame=noisy)
+    begin_dataset(root, dataset_record())
+    stage_synthetic(root, 0, change_frame=noisy)
+    commit_shard(root, 0, motion_indices=[0], provenance=PROVENANCE)
     return open_dataset(root).shards[0].source("frames")
 
 
