@@ -79,7 +79,7 @@ $(PARITY): $(DEV)
 
 $(SHARDS)/.installed: $(SHARDS)/bin/python pyproject.toml requirements.lock
 	@echo "installing shards and its tests"
-	@PYTHONWARNINGS=ignore $< $(INSTALL) --editable '.[shards-dev]'
+	@PYTHONWARNINGS=ignore $< $(INSTALL) --editable '.[shards-tests]'
 	@touch $@
 
 setup: $(RUNTIME) ## create .venv and install the generator

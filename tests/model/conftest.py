@@ -1,5 +1,6 @@
 """What PyTorch draws without a generator is the same for every test; one training of both stages serves all tests."""
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,8 +22,17 @@ def _seeded(_seeded_module: None) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class StageOneRun:
+    """A finished run of stage 1, its configuration and its data. Do not change them."""
+
+    dataset: Path
+    config: Path
+    folder: Path
+
+
+@dataclass(frozen=True, kw_only=True)
 class Runs:
-    """What the tests start from. Do not change it."""
+    """Both stages, ready to reconstruct. Do not change them."""
 
     dataset: Path
     one: Path
@@ -30,13 +40,17 @@ class Runs:
 
 
 @pytest.fixture(scope="session")
-def runs(tmp_path_factory) -> Runs:
-    root = tmp_path_factory.mktemp("runs")
+def stage_one_run(tmp_path_factory) -> StageOneRun:
+    root = tmp_path_factory.mktemp("stage_one")
     dataset = write_balls(root / "balls", splits=[["train", "train"]], n_frames=4)
-    runs = Runs(
-        dataset=dataset,
-        one=train_small(root / "one", small_stage_one(dataset)),
-        two=train_small(root / "two", small_stage_two(dataset)),
-    )
-    fill_some(runs.one)
-    return runs
+    folder = train_small(root / "run", small_stage_one(dataset))
+    return StageOneRun(dataset=dataset, config=folder.with_suffix(".yaml"), folder=folder)
+
+
+@pytest.fixture(scope="session")
+def runs(stage_one_run: StageOneRun, tmp_path_factory) -> Runs:
+    root = tmp_path_factory.mktemp("runs")
+    one = Path(shutil.copytree(stage_one_run.folder, root / "one"))
+    fill_some(one)
+    two = train_small(root / "two", small_stage_two(stage_one_run.dataset))
+    return Runs(dataset=stage_one_run.dataset, one=one, two=two)

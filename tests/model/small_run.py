@@ -32,6 +32,7 @@ def small_settings(dataset: Path) -> dict[str, Any]:
         recipe |= {"batch_size": 2} if component == "vae" else {"batch_size": 2, "views": [1, 2]}
         recipe["trainer"] |= {
             "steps": STEPS,
+            "precision": "float32",  # the same on every machine, and fast on every one
             "checkpoint_every": 1,
             "keep_checkpoints": 2,
             "validate_every": STEPS,

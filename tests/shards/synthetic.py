@@ -5,6 +5,7 @@ verifier must accept it. No randomness but the seed given.
 """
 
 import hashlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -50,14 +51,20 @@ def dataset_record() -> DatasetRecord:
 
 
 def stage_synthetic(
-    root: Path, motion_index: int, *, cameras: int = 2, n_frames: int = 3, size_px: int = 40
+    root: Path,
+    motion_index: int,
+    *,
+    cameras: int = 2,
+    n_frames: int = 3,
+    size_px: int = 40,
+    change_frame: Callable[[FrameRow], FrameRow] = lambda frame: frame,
 ) -> MotionRecord:
     object_row = synthetic_object(motion_index % 2)
     clips, frames = [], []
     for camera_index in range(cameras):
         clip, clip_frames = synthetic_clip(object_row, motion_index, camera_index, n_frames, size_px)
         clips.append(clip)
-        frames.extend(clip_frames)
+        frames.extend(change_frame(frame) for frame in clip_frames)
     return stage_motion(
         root,
         0,

@@ -38,6 +38,7 @@ def small_stage_two(dataset: Path) -> dict[str, Any]:
         recipe = config[component]["recipe"]
         recipe |= {"batch_size": 1} if component == "slat_vae" else {"batch_size": 1, "views": [1, 1]}
         recipe["trainer"] |= {"steps": 2, "checkpoint_every": 2, "validate_every": 2, "log_every": 1}
+        recipe["trainer"]["precision"] = "float32"
     return config
 
 

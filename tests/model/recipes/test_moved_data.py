@@ -10,54 +10,40 @@ from safetensors.torch import load_file
 
 from model.recipes.config import load_config
 from tests.model.data.balls import write_balls
-from tests.model.small_run import fails, forehoi, small_settings, write_config
+from tests.model.small_run import fails, forehoi
 from tests.model.stages import stage_one
 
 
-@pytest.fixture(scope="module")
-def root(tmp_path_factory) -> Path:
-    """A dataset, the configuration of a run on it, and the run. Do not change it."""
-    root = tmp_path_factory.mktemp("moved")
-    write_balls(root / "here")
-    settings = small_settings(root / "here")
-    settings["hand_encoder"] = None
-    settings["encoders"]["hand"] = {"packaged_grid": 8}
-    config = write_config(root / "small.yaml", settings)
-    status, output = forehoi("train", config, "--out", root / "run")
-    assert status == 0, output
-    return root
-
-
 @pytest.fixture
-def elsewhere(root, tmp_path) -> tuple[Path, Path]:
+def elsewhere(stage_one_run, tmp_path) -> tuple[Path, Path]:
     """A copy of the run, and its configuration with data in another place, where there are none yet."""
-    run = Path(shutil.copytree(root / "run", tmp_path / "run"))
-    text = (root / "small.yaml").read_text().replace(str(root / "here"), str(tmp_path / "there"))
+    run = Path(shutil.copytree(stage_one_run.folder, tmp_path / "run"))
+    text = stage_one_run.config.read_text().replace(str(stage_one_run.dataset), str(tmp_path / "there"))
     config = tmp_path / "small.yaml"
     config.write_text(text)
     return run, config
 
 
-def test_a_run_goes_on_with_data_that_were_moved(root, elsewhere, tmp_path):
+def test_a_run_goes_on_with_data_that_were_moved(stage_one_run, elsewhere, tmp_path):
     run, config = elsewhere
-    shutil.copytree(root / "here", tmp_path / "there")
+    shutil.copytree(stage_one_run.dataset, tmp_path / "there")
     shutil.rmtree(run / "stage_one" / "checkpoints" / "step-00000002")  # as if stopped after the first step
     status, output = forehoi("train", config, "--out", run)
     assert status == 0, output
     state = json.loads((run / "stage_one" / "checkpoints" / "step-00000002" / "state.json").read_text())
     assert str(tmp_path / "there") in state["config_yaml"]
-    before = json.loads((root / "run" / "stage_one" / "metrics.json").read_text())
+    before = json.loads((stage_one_run.folder / "stage_one" / "metrics.json").read_text())
     assert json.loads((run / "stage_one" / "metrics.json").read_text()) == before
 
 
-def test_a_run_that_was_stopped_before_its_first_checkpoint_ends_as_one_in_one_go(root, tmp_path):
+def test_a_run_that_was_stopped_before_its_first_checkpoint_ends_as_one_in_one_go(stage_one_run, tmp_path):
     """It left nothing but what it measured of the data."""
-    run = Path(shutil.copytree(root / "run", tmp_path / "run"))
+    run = Path(shutil.copytree(stage_one_run.folder, tmp_path / "run"))
     shutil.rmtree(run / "stage_one" / "checkpoints")
-    status, output = forehoi("train", root / "small.yaml", "--out", run)
+    status, output = forehoi("train", stage_one_run.config, "--out", run)
     assert status == 0, output
     newest = Path("stage_one") / "checkpoints" / "step-00000002" / "weights.safetensors"
-    again, before = load_file(run / newest), load_file(root / "run" / newest)
+    again, before = load_file(run / newest), load_file(stage_one_run.folder / newest)
     assert again.keys() == before.keys()
     assert all(torch.equal(again[name], before[name]) for name in before)
 
@@ -66,7 +52,7 @@ def test_a_run_that_was_stopped_before_its_first_checkpoint_ends_as_one_in_one_g
 def test_other_data_are_refused(elsewhere, tmp_path, component):
     """Of the component itself, and of one that it stands on."""
     run, config = elsewhere
-    write_balls(tmp_path / "there", n_frames=4)
+    write_balls(tmp_path / "there")
     shutil.rmtree(run / "stage_one")
     line = fails("train", component, "--config", config, "--out", run)
     assert "vae/checkpoints/step-00000002: was trained on other data" in line

@@ -64,6 +64,7 @@ def config(dataset) -> StageTwoTrainingConfig:
         recipe = settings[component]["recipe"]
         recipe["batch_size"] = 1
         recipe["trainer"] |= {"steps": 2, "checkpoint_every": 1, "validate_every": 2, "log_every": 1}
+        recipe["trainer"]["precision"] = "float32"
     return stage_two(parse_config(yaml.safe_dump(settings), where="small"))
 
 

@@ -40,7 +40,7 @@ def small_config(dataset: Path, cache: Path | None) -> StageTwoTrainingConfig:
         recipe = settings[component]["recipe"]
         recipe["batch_size"] = 1
         recipe["trainer"] |= {"steps": steps, "checkpoint_every": steps, "validate_every": steps}
-        recipe["trainer"]["log_every"] = 1
+        recipe["trainer"] |= {"log_every": 1, "precision": "float32"}
         recipe["optimizer"]["warmup_steps"] = 2
     return stage_two(parse_config(yaml.safe_dump(settings), where="small"))
 

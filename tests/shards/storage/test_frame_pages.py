@@ -12,8 +12,8 @@ from shards.reader import open_dataset
 from shards.storage.frame_pages import local_pages
 from shards.storage.images import encode_rgb_png
 from shards.storage.parquet import ParquetSource
-from shards.writer import begin_dataset, commit_shard, stage_motion
-from tests.shards.synthetic import PROVENANCE, dataset_record, synthetic_clip, synthetic_object
+from shards.writer import begin_dataset, commit_shard
+from tests.shards.synthetic import PROVENANCE, dataset_record, stage_synthetic
 
 COLUMNS = ("rgb", "masks")
 
@@ -27,15 +27,8 @@ def noisy(frame):
 @pytest.fixture(scope="module")
 def source(tmp_path_factory: pytest.TempPathFactory) -> ParquetSource:
     root = tmp_path_factory.mktemp("pages") / "data"
-    object_row, clips, frames = synthetic_object(0), [], []
-    for camera in range(2):
-        clip, clip_frames = synthetic_clip(object_row, 0, camera, 3, 40)
-        clips.append(clip)
-        frames += [noisy(frame) for frame in clip_frames]
     begin_dataset(root, dataset_record())
-    stage_motion(
-        root, 0, 0, object_row=object_row, clips=clips, frames=frames, timings_s={}, provenance=PROVENANCE
-    )
+    stage_synthetic(root, 0, change_frame=noisy)
     commit_shard(root, 0, motion_indices=[0], provenance=PROVENANCE)
     return open_dataset(root).shards[0].source("frames")
 
