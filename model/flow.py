@@ -25,19 +25,15 @@ __all__ = [
     "UniformTime",
     "Velocity",
     "binary_velocity",
-    "clean_from_velocity",
     "euler_path",
     "euler_sample",
     "guided",
     "interpolate",
     "joint_cfm_loss",
-    "noise_from_velocity",
     "noise_like",
     "preconditioned_velocity",
     "time_grid",
     "times_from_uniform",
-    "velocity_from_clean",
-    "velocity_from_noise",
     "velocity_target",
 ]
 
@@ -65,34 +61,6 @@ def velocity_target(
 ) -> Float[Tensor, " batch *shape"]:
     """dx_t/dt = noise - clean: what the network regresses (Eq. 2: epsilon - x_0)."""
     return noise - clean
-
-
-def clean_from_velocity(
-    x_t: Float[Tensor, " batch *shape"], velocity: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, " batch *shape"]:
-    """clean = x_t - t velocity."""
-    return x_t - _per_sample(t, x_t) * velocity
-
-
-def noise_from_velocity(
-    x_t: Float[Tensor, " batch *shape"], velocity: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, " batch *shape"]:
-    """noise = x_t + (1 - t) velocity."""
-    return x_t + (1 - _per_sample(t, x_t)) * velocity
-
-
-def velocity_from_clean(
-    x_t: Float[Tensor, " batch *shape"], clean: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, " batch *shape"]:
-    """velocity = (x_t - clean) / t; not finite at t = 0, where x_t carries no noise."""
-    return (x_t - clean) / _per_sample(t, x_t)
-
-
-def velocity_from_noise(
-    x_t: Float[Tensor, " batch *shape"], noise: Float[Tensor, " batch *shape"], t: Float[Tensor, " batch"]
-) -> Float[Tensor, " batch *shape"]:
-    """velocity = (noise - x_t) / (1 - t); not finite at t = 1, where x_t carries no signal."""
-    return (noise - x_t) / (1 - _per_sample(t, x_t))
 
 
 def preconditioned_velocity(

@@ -73,16 +73,22 @@ class Augmentation:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SquareCrop:
-    """A crop of one view: crop_px = A_crop_from_image @ (u, v, 1)."""
+    """A square of an image: crop_px = A_crop_from_image @ (u, v, 1)."""
 
     size: int  # px, of the result
     A_crop_from_image: Float[np.ndarray, "2 3"]
-    K: Float[np.ndarray, "3 3"]  # of the crop
-    T_crop_from_cam: Float[np.ndarray, "4 4"]  # roll about the optical axis
 
-    def points(self, points_px: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 2"]:
+    def points(self, points_px: Float[np.ndarray, "*point 2"]) -> Float[np.ndarray, "*point 2"]:
         """Image pixels to crop pixels."""
         return points_px @ self.A_crop_from_image[:, :2].T + self.A_crop_from_image[:, 2]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewCrop(SquareCrop):
+    """A square of a view whose camera is known."""
+
+    K: Float[np.ndarray, "3 3"]  # of the crop
+    T_crop_from_cam: Float[np.ndarray, "4 4"]  # roll about the optical axis
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -108,7 +114,7 @@ def draw_crop(
     size: int,
     augmentation: Augmentation,
     rng: np.random.Generator,
-) -> SquareCrop:
+) -> ViewCrop:
     """A random square that holds the whole box, turned. Always draws four numbers from `rng`."""
     margin = rng.uniform(*augmentation.margin)
     roll = np.deg2rad(rng.uniform(*augmentation.roll_deg))
@@ -131,7 +137,7 @@ def draw_crop(
     K_crop[:2, 2] = A[:, :2] @ K[:2, 2] + offset  # where the optical axis meets the crop
     T_crop_from_cam = np.eye(4)
     T_crop_from_cam[:2, :2] = turn
-    return SquareCrop(size=size, A_crop_from_image=A, K=K_crop, T_crop_from_cam=T_crop_from_cam)
+    return ViewCrop(size=size, A_crop_from_image=A, K=K_crop, T_crop_from_cam=T_crop_from_cam)
 
 
 def crop_image(

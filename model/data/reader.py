@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, UInt8
 from model.data.batch import OCCUPANCY_VOXELS, SurfaceTarget, TrainingSample
 from model.data.clip_frames import BLOB_COLUMNS, ClipFrames
 from model.data.config import StreamConfig
-from model.data.crop import CroppedMasks, SquareCrop, crop_image, crop_masks, draw_crop, mirrored, union_box
+from model.data.crop import CroppedMasks, ViewCrop, crop_image, crop_masks, draw_crop, mirrored, union_box
 from model.data.index import FRAME_COLUMNS, MotionIndex, MotionRef
 from model.data.order import RandomStream, SampleKey, random_stream
 from shards.errors import CorruptShardError, ImageError, RowError
@@ -60,7 +60,7 @@ class _Object:
 class _View:
     """One view before it is stacked with the others."""
 
-    crop: SquareCrop
+    crop: ViewCrop
     image: UInt8[np.ndarray, "size size 3"]
     masks: CroppedMasks
     T_cam_from_obj: Float[np.ndarray, "4 4"]

@@ -1,4 +1,4 @@
-"""The paper's image encoder: DINOv2-L/14 with registers, conditioned as in TRELLIS (FORMATS 4.5)."""
+"""The paper's image encoder, DINOv2-L/14 with registers: patch tokens as TRELLIS conditions on them (FORMATS 4.5)."""
 
 from dataclasses import dataclass
 from pathlib import Path

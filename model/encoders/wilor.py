@@ -1,9 +1,9 @@
 """The paper's hand prior: the ViT of WiLoR (FORMATS 5), run on the same whole crop as the image encoder.
 
 WiLoR cuts its own box around a hand and mirrors left ones; here the crop holds hand and object, so tokens
-stay aligned with the image tokens, and left hands are shown as they are. The paper names 224 x 224 and 1024
-channels, neither of which is WiLoR's (256 x 192, 1280): the position embedding is interpolated from
-16 x 12 patches to 14 x 14, and the aggregator projects 1280 channels.
+stay aligned with the image tokens, and left hands are shown as they are (DECISIONS: "WiLoR sees the whole
+crop"). The paper names 224 x 224 and 1024 channels, neither of which is WiLoR's (256 x 192, 1280): the position
+embedding is interpolated from 16 x 12 patches to 14 x 14, and the aggregator projects 1280 channels.
 """
 
 from dataclasses import dataclass

@@ -1,6 +1,6 @@
 """reconstruct: images of a hand that holds an object to amodal masks, voxels and a closed coloured mesh."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,6 @@ from model.inference.networks import Networks, StageTwoNetworks
 from model.inference.stage_clock import StageClock
 from model.inference.stages import run_stage_one, run_stage_two
 from model.surface.watertight_mesh import ExtractedSurface, SurfaceExtractionConfig, extracted_surface
-from model.video.frame_choice import FrameChoice, choose_frames
 from model.video.frames import VideoFrame, VideoFrames
 from model.video.square_crop import SquareWindow
 
@@ -25,7 +24,6 @@ class ReconstructionSettings:
     """What the networks do not decide."""
 
     seed: int  # of the noise that is denoised; 0 or more
-    views: int | None  # informative frames to choose of those given; None: all of them
     closer_crop: CloserCrop | None  # None: one pass, on the first squares
     min_component_share: float  # as in SurfaceExtractionConfig, all three
     max_faces: int
@@ -34,7 +32,6 @@ class ReconstructionSettings:
 
 STANDARD = ReconstructionSettings(
     seed=0,
-    views=None,
     closer_crop=CloserCrop(max_side_share=0.9, min_side_share=0.1),
     min_component_share=0.01,
     max_faces=200_000,
@@ -46,8 +43,7 @@ STANDARD = ReconstructionSettings(
 class Reconstruction:
     """What was found in some frames. Shapes are in the canonical frame: Z up, cube [-0.5, 0.5]^3."""
 
-    frames: VideoFrames  # those used
-    choice: FrameChoice | None  # how `reconstruct` chose them, if it did
+    frames: VideoFrames
     crops: tuple[FrameCrop, ...]  # of the last pass
     windows: tuple[SquareWindow, ...]
     images: Float32[np.ndarray, "view 3 size size"]  # crops as stage 1 saw them, sRGB 0..1
@@ -55,7 +51,6 @@ class Reconstruction:
     occupancy: Bool[np.ndarray, "64 64 64"]  # [i, j, k] along x, y, z
     surface: ExtractedSurface | None  # None without stage 2
     seed: int
-    seconds: Mapping[str, float]  # wall clock, by stage
     notes: tuple[str, ...]  # what the user should know
 
     @property
@@ -88,18 +83,15 @@ def reconstruct(
     boxes_px: Sequence[Float[np.ndarray, "4"]] | None = None,
     clock: StageClock | None = None,
 ) -> Reconstruction:
-    """Masks and voxels (stage 1), then the surface (stage 2). The same seed gives the same bits on one machine.
+    """Masks and voxels (stage 1), then the surface (stage 2), from all the frames.
 
-    `boxes_px`: x0, y0, x1, y1 around hand and object in each image, for the first crop. ModelError when there is no
-    object in the frames, or no surface.
+    Of many frames take informative ones first: `frames.select(choose_frames(frames, 6).positions)`.
+
+    The same seed gives the same bits on one machine's CPU; on CUDA sparse convolutions add in any order. `boxes_px`:
+    x0, y0, x1, y1 around hand and object in each image, for the first crop. `clock` learns how long each stage takes.
+    ModelError when there is no object in the frames, or no surface.
     """
     clock = clock or StageClock()
-    choice = None
-    if settings.views is not None and settings.views < len(frames):
-        with clock.stage("choose frames"):
-            choice = choose_frames(frames, settings.views)
-        boxes_px = None if boxes_px is None else [boxes_px[int(i)] for i in choice.positions]
-        frames = frames.select(choice.positions)
     crops = first_crops(frames, boxes_px)
     if settings.closer_crop is not None:
         with clock.stage("find hand and object"):
@@ -121,7 +113,6 @@ def reconstruct(
             surface = extracted_surface(fields, _extraction_config(settings, two))
     return Reconstruction(
         frames=frames,
-        choice=choice,
         crops=tuple(crops),
         windows=one.windows,
         images=one.images,
@@ -129,7 +120,6 @@ def reconstruct(
         occupancy=one.occupancy,
         surface=surface,
         seed=settings.seed,
-        seconds=clock.seconds,
         notes=_notes(frames, networks, one.masks, has_surface=surface is not None),
     )
 

@@ -1,17 +1,15 @@
 """Low-rank adaptation of attention projections, through peft (section 4.1: r = 64, alpha = 128, dropout 0).
 
-Adapters are written in peft's own format, so `peft.PeftModel.from_pretrained(branch, folder)` reads them too.
+Adapters are written in peft's own format: `peft.PeftModel.from_pretrained(branch, folder)` reads them.
 """
 
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from peft import LoraConfig, get_peft_model_state_dict, set_peft_model_state_dict
+from peft import LoraConfig, get_peft_model_state_dict
 from peft.mapping import inject_adapter_in_model
 from peft.tuners.lora import LoraLayer
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import nn
 
 from model.errors import ModelError
@@ -21,19 +19,13 @@ __all__ = [
     "LoraSettings",
     "add_lora",
     "export_adapter",
-    "import_adapter",
     "merge_lora",
-    "trainable_parameters",
 ]
 
 ATTENTION_PROJECTIONS = ("to_qkv", "to_q", "to_kv", "to_out")
 """Every projection of a self- or cross-attention; the paper adapts "qkv and output projections"."""
 
-_CONFIG_FILE, _WEIGHTS_FILE, _PEFT_PREFIX = (
-    "adapter_config.json",
-    "adapter_model.safetensors",
-    "base_model.model.",
-)
+_WEIGHTS_FILE, _PEFT_PREFIX = "adapter_model.safetensors", "base_model.model."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -84,11 +76,6 @@ def merge_lora(branch: nn.Module) -> None:
     branch.requires_grad_(True)
 
 
-def trainable_parameters(module: nn.Module) -> dict[str, tuple[int, ...]]:
-    """Names and shapes of the parameters that an optimizer would change."""
-    return {name: tuple(p.shape) for name, p in module.named_parameters() if p.requires_grad}
-
-
 def export_adapter(branch: nn.Module, folder: Path) -> None:
     """Write the adapter of `branch` (settings and weights only) into `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -97,37 +84,3 @@ def export_adapter(branch: nn.Module, folder: Path) -> None:
     state = get_peft_model_state_dict(branch)
     weights = {_PEFT_PREFIX + name: tensor.detach().contiguous().cpu() for name, tensor in state.items()}
     save_file(weights, str(folder / _WEIGHTS_FILE), metadata={"format": "pt"})
-
-
-def import_adapter(branch: nn.Module, folder: Path) -> None:
-    """Add the adapter written by `export_adapter` (or by peft) to a branch that has none.
-
-    ModelError when a file is absent or unreadable, or when any adapter tensor does not fit the branch.
-    """
-    for name in (_CONFIG_FILE, _WEIGHTS_FILE):
-        if not (folder / name).is_file():
-            raise ModelError(
-                folder, f"{name} not found", expected="a peft adapter folder", action="Check the path."
-            )
-    try:
-        weights = load_file(str(folder / _WEIGHTS_FILE))
-    except SafetensorError as error:
-        raise ModelError(
-            folder / _WEIGHTS_FILE, str(error), expected="a safetensors file", action="Copy it again."
-        ) from error
-    config = LoraConfig.from_pretrained(str(folder))
-    assert isinstance(config, LoraConfig)
-    inject_adapter_in_model(config, branch)
-    state = {name.removeprefix(_PEFT_PREFIX): tensor for name, tensor in weights.items()}
-    expected = {name: tuple(tensor.shape) for name, tensor in get_peft_model_state_dict(branch).items()}
-    found = {name: tuple(tensor.shape) for name, tensor in state.items()}
-    wrong = sorted(name for name in expected.keys() | found.keys() if expected.get(name) != found.get(name))
-    if wrong:
-        raise ModelError(
-            folder,
-            f"{len(wrong)} adapter tensors do not fit, first {wrong[0]} {found.get(wrong[0], 'absent')}",
-            expected=f"{expected.get(wrong[0], 'no such tensor')}",
-            action="Use the config of the model the adapter was trained on.",
-        )
-    with torch.no_grad():
-        set_peft_model_state_dict(branch, state)

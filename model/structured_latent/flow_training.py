@@ -68,7 +68,12 @@ class SlatFlowTask:
         return self.network.condition(self.image_encoder(images), self.hand_encoder(images))
 
     def loss(self, batch: Batch, generators: Sequence[torch.Generator]) -> Losses:
-        """Mean squared error of the velocity: mean over a sample's voxels, then over samples (TRELLIS, stage 2)."""
+        """Mean squared error of the velocity: mean over a sample's voxels, then over samples.
+
+        TRELLIS takes one mean over the voxels of all samples, so that large objects count more. Here each object counts
+        alike, and the loss of a global batch does not depend on how ranks share it. `config.time`: TRELLIS draws t
+        logit-normal(1, 1), the paper uniformly.
+        """
         clean = self.clean_latent(batch)
         grid, device = clean.grid, clean.features.device
         t = times_from_uniform(self.config.time, uniform(generators, device))

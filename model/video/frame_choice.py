@@ -35,7 +35,6 @@ class FrameChoice:
     rank: Int[np.ndarray, " chosen"]  # 0: chosen first
     sharpness: Float[np.ndarray, " chosen"]  # 0..1, against the sharpest of the neighbouring candidates
     novelty: Float[np.ndarray, " chosen"]  # 0..1, least difference to those chosen before; 1 for the first
-    n_candidates: int
 
     def record(self) -> list[dict[str, float | int]]:
         """One entry per chosen frame, for reconstruction.json."""
@@ -75,7 +74,6 @@ def choose_frames(frames: VideoFrames, count: int) -> FrameChoice:
         rank=rank,
         sharpness=sharpness[positions],
         novelty=np.array(novelty)[rank],
-        n_candidates=len(frames),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 
 from model.errors import ModelError
 
@@ -85,10 +85,6 @@ class VideoFrames:
     def indices(self) -> Int[np.ndarray, " frame"]:
         """Places in the source."""
         return np.array([frame.index for frame in self.frames])
-
-    @property
-    def times_s(self) -> Float[np.ndarray, " frame"]:
-        return np.array([frame.time_s for frame in self.frames], np.float64)
 
     @property
     def changes(self) -> tuple[str, ...]:

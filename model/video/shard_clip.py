@@ -3,10 +3,6 @@
 from collections.abc import Sequence
 from difflib import get_close_matches
 
-import numpy as np
-from jaxtyping import Float
-
-from model.data.crop import union_box
 from model.errors import ModelError
 from model.video.frames import (
     ReadLimits,
@@ -18,9 +14,7 @@ from model.video.frames import (
 )
 from shards.reader import Shard, open_dataset, open_shard
 
-__all__ = ["annotated_boxes", "read_clip", "shards_at"]
-
-_BOXES = ("hand_box_visible_px", "object_box_amodal_px")
+__all__ = ["read_clip", "shards_at"]
 
 
 def read_clip(address: str, clip_id: str, limits: ReadLimits, indices: Sequence[int] | None) -> VideoFrames:
@@ -53,19 +47,6 @@ def read_clip(address: str, clip_id: str, limits: ReadLimits, indices: Sequence[
             )
         )
     return VideoFrames(source=source, kind="clip", frames=tuple(images), n_source_frames=n, notes=())
-
-
-def annotated_boxes(address: str, clip_id: str, frames: VideoFrames) -> Float[np.ndarray, "frame 4"]:
-    """Annotated boxes of visible hand and amodal object together, image pixels, for each of `frames`.
-
-    Truth that a user's video does not have: only for evaluations that give it to every method.
-    """
-    table = _shard_of(address, clip_id).read_frames(clip_id, _BOXES)
-    boxes = []
-    for frame in frames.frames:
-        box = union_box(np.stack([table[name][frame.index] for name in _BOXES]), frame.source_size)
-        boxes.append(box * np.tile(np.divide(frame.image_size, frame.source_size), 2))
-    return np.stack(boxes)
 
 
 def shards_at(address: str) -> tuple[Shard, ...]:

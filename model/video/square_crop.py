@@ -36,9 +36,12 @@ class SquareWindow:
     side_px: float  # in the image
     size: int  # px of the crop
 
-    def crop_from_image(self, points_px: Float[np.ndarray, "*point 2"]) -> Float[np.ndarray, "*point 2"]:
-        """Image pixels to crop pixels."""
-        return (points_px - np.array(self.corner_px)) * (self.size / self.side_px)
+    @property
+    def crop(self) -> SquareCrop:
+        """What cuts it out."""
+        scale, (x, y) = self.size / self.side_px, self.corner_px
+        A = np.array([[scale, 0.0, -scale * x], [0.0, scale, -scale * y]])
+        return SquareCrop(size=self.size, A_crop_from_image=A)
 
     def image_from_crop(self, points_px: Float[np.ndarray, "*point 2"]) -> Float[np.ndarray, "*point 2"]:
         """Crop pixels to image pixels."""
@@ -66,10 +69,7 @@ def square_crop(
 ) -> tuple[Float32[np.ndarray, "3 size size"], SquareWindow]:
     """The crop, sRGB 0..1, resampled as in training, and where it lies."""
     window = square_window((image.shape[1], image.shape[0]), box_px, size)
-    scale = size / window.side_px
-    (x, y), unknown = window.corner_px, np.eye(3)  # the resampling does not look at the camera
-    A = np.array([[scale, 0.0, -scale * x], [0.0, scale, -scale * y]])
-    crop = crop_image(image, SquareCrop(size=size, A_crop_from_image=A, K=unknown, T_crop_from_cam=np.eye(4)))
+    crop = crop_image(image, window.crop)
     return np.ascontiguousarray(crop.transpose(2, 0, 1), np.float32) / np.float32(255), window
 
 

@@ -6,9 +6,9 @@ Groups in our weight files, of which any may be absent:
     stage_two.normalisation.*                        of the latents that it was trained on
     stage_two.context.* stage_two.fusion.*           the rest of stage 2, of our own trainings
     slat_vae.encoder.* slat_vae.surface.*            slat_enc_swin8_B_64l8, slat_dec_mesh_swin8_B_64l8m256c
-    slat_vae.gaussians.*                             slat_dec_gs_swin8_B_64l8gs32
 
-slat_dec_rf_swin8_B_64l8r16, the radiance-field decoder, has no use here.
+The decoders of gaussians and of radiance fields, slat_dec_gs_swin8_B_64l8gs32 and slat_dec_rf_swin8_B_64l8r16, have no
+use here.
 """
 
 import json
@@ -21,9 +21,8 @@ from model.errors import ModelError
 from model.networks.sparse.convolution import pointwise_from_spconv
 from model.networks.view_fusion import ViewFusion
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
-from model.structured_latent.vae.decoder import GaussianDecoder, SurfaceDecoder
+from model.structured_latent.vae.decoder import SurfaceDecoder
 from model.structured_latent.vae.encoder import SlatEncoder
-from model.structured_latent.vae.gaussians import offset_perturbation
 from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.tensor_files.safetensors_file import read_header
@@ -31,7 +30,6 @@ from model.weights.published import PublishedNetwork, prefixed, published_shapes
 from model.weights.weight_file import load_weights
 
 __all__ = [
-    "GAUSSIANS",
     "SLAT_ENCODER",
     "SLAT_FLOW",
     "STAGE_TWO",
@@ -44,14 +42,13 @@ __all__ = [
 
 STAGE_TWO = "stage_two."
 SLAT_FLOW = f"{STAGE_TWO}flow."
-SLAT_ENCODER, SURFACE, GAUSSIANS = "slat_vae.encoder.", "slat_vae.surface.", "slat_vae.gaussians."
+SLAT_ENCODER, SURFACE = "slat_vae.encoder.", "slat_vae.surface."
 
 _WHERE = "slat weights"
 _NETWORKS = {
     "flow": ("slat_flow_img_dit_L_64l8p2", ("SLatFlowModel", "ElasticSLatFlowModel")),
     "encoder": ("slat_enc_swin8_B_64l8", ("SLatEncoder", "ElasticSLatEncoder")),
     "surface": ("slat_dec_mesh_swin8_B_64l8m256c", ("SLatMeshDecoder", "ElasticSLatMeshDecoder")),
-    "gaussians": ("slat_dec_gs_swin8_B_64l8gs32", ("SLatGaussianDecoder", "ElasticSLatGaussianDecoder")),
 }
 # `slat_normalization` of the pipeline.json of TRELLIS-image-large.
 _MEAN = (
@@ -102,14 +99,12 @@ def slat_networks(flow: SlatFlowConfig, vae: SlatVaeConfig) -> tuple[PublishedNe
             "flow": SlatFlow(flow),
             "encoder": SlatEncoder(vae),
             "surface": SurfaceDecoder(vae),
-            "gaussians": GaussianDecoder(vae),
         }
         fusion = ViewFusion(flow.condition_channels)
     conversions = {
         "flow": _flow_tensors,
         "encoder": _encoder_tensors,
         "surface": _surface_tensors,
-        "gaussians": _gaussian_tensors,
     }
     of_flow = {"resolution": flow.resolution, "num_heads": flow.heads, "patch_size": flow.patch}
     of_vae = {"resolution": vae.resolution, "num_heads": vae.heads, "window_size": vae.window}
@@ -163,19 +158,6 @@ def _surface_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor
         for name, tensor in tensors.items()
     }
     return prefixed(SURFACE, converted)
-
-
-def _gaussian_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
-    error = float((tensors["offset_perturbation"].float() - offset_perturbation()).abs().max())
-    # Float16 is within 4e-4, bfloat16 4e-3; another sequence or order is off by about 1.
-    if not error < 1e-2:
-        raise ModelError(
-            path,
-            f"offset_perturbation differs by {error:.2g} from the Hammersley points",
-            expected="TRELLIS's layout of 32 gaussians per voxel",
-            action="Use an unmodified checkpoint.",
-        )
-    return prefixed(GAUSSIANS, tensors)
 
 
 def _published_normalisation(path: Path) -> LatentNormalisation:

@@ -176,13 +176,6 @@ class SparseGrid:
         sizes = (self.batch_size, self.resolution) == (other.batch_size, other.resolution)
         return sizes and torch.equal(self.keys, other.keys)
 
-    def occupancy(self) -> Bool[Tensor, "batch i j k"]:
-        """The dense volumes."""
-        size = (self.batch_size, *[self.resolution] * 3)
-        dense = torch.zeros(size, dtype=torch.bool, device=self.device)
-        dense.view(-1)[self.keys] = True
-        return dense
-
     def to(self, device: torch.device) -> "SparseGrid":
         """The same voxels on a device; itself when already there. Derived maps are made anew."""
         if device == self.device:

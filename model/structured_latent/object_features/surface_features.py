@@ -53,17 +53,15 @@ class SurfaceFeatures:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VoxelFeatures:
-    """Features of the active voxels, in the order they were given; canonical axes."""
+    """Features of the active voxels, in the order they were given; canonical axes.
+
+    Normal and colour of a voxel without a surface point inside are those of the point nearest to its centre.
+    """
 
     distances: Float32[np.ndarray, "voxel 8"]  # at CORNERS, in voxels, negative inside, within +-2
     normals: Float32[np.ndarray, "voxel 3"]  # mean of the surface points inside, length 0..1
     colors: Float32[np.ndarray, "voxel 3"]  # mean, sRGB 0..1
     counts: Int[np.ndarray, " voxel"]  # surface points inside
-
-    @property
-    def without_points(self) -> int:
-        """Voxels without a surface point inside: normal and colour are those of the point nearest to the centre."""
-        return int(np.count_nonzero(self.counts == 0))
 
     def rows(self) -> Float32[np.ndarray, "voxel 16"]:
         """What the encoder reads: all of it, about -2..2; colours centred."""

@@ -1,29 +1,27 @@
-"""Decoders of structured latents: surface and gaussians (FORMATS 4.1).
+"""Decoder of structured latents: the surface (FORMATS 4.1).
 
-With the `paper` values of `SlatVaeConfig` they have the parameters of slat_dec_mesh_swin8_B_64l8m256c and of
-slat_dec_gs_swin8_B_64l8gs32.
+With the `paper` values of `SlatVaeConfig` it has the parameters of slat_dec_mesh_swin8_B_64l8m256c.
 """
 
 import math
 from itertools import pairwise
 
-from torch import Tensor, nn
+from torch import nn
 
 from model.networks.sparse.blocks import SparseSubdivideBlock3d
 from model.networks.sparse.tensor import SparseTensor
-from model.networks.transformer import initialise_head, initialise_transformer, layer_norm
-from model.structured_latent.vae.gaussians import GAUSSIAN_CHANNELS, offset_perturbation
+from model.networks.transformer import initialise_head, initialise_transformer
 from model.structured_latent.vae.latent import SlatVaeConfig, require_layout
 from model.structured_latent.vae.trunk import run_trunk, trunk_blocks
 from model.surface.fields import CHANNELS
 
-__all__ = ["GaussianDecoder", "SurfaceDecoder"]
+__all__ = ["SurfaceDecoder"]
 
 _GROUPS = 32  # of the published group norms; narrower networks have as many of them as divide their widths
 
 
 class SurfaceDecoder(nn.Module):
-    """Latents to the 101 channels of `model.surface.fields`, on a grid of `surface_resolution`."""
+    """Latents to the 101 channels of `model.surface.fields`, on a grid 2 ** len(upsample) times as fine."""
 
     def __init__(self, config: SlatVaeConfig) -> None:
         super().__init__()
@@ -49,28 +47,3 @@ class SurfaceDecoder(nn.Module):
         for block in self.upsample:
             h = block(h)
         return h.map(self.out_layer)
-
-
-class GaussianDecoder(nn.Module):
-    """Latents to 32 gaussians per voxel, on the same grid; `model.structured_latent.vae.gaussians` reads them."""
-
-    offset_perturbation: Tensor
-
-    def __init__(self, config: SlatVaeConfig) -> None:
-        super().__init__()
-        self.config = config
-        self.input_layer = nn.Linear(config.latent_channels, config.channels)
-        self.blocks = trunk_blocks(config)
-        self.out_layer = nn.Linear(config.channels, GAUSSIAN_CHANNELS)
-        self.register_buffer("offset_perturbation", offset_perturbation())
-        initialise_transformer(self, t_embedder=None)
-        initialise_head(self.out_layer)
-
-    def forward(self, latent: SparseTensor) -> SparseTensor:
-        """448 channels per voxel; ModelError for other channels or another resolution."""
-        config = self.config
-        require_layout(
-            "gaussian decoder", latent, channels=config.latent_channels, resolution=config.resolution
-        )
-        h = run_trunk(latent, self.input_layer, self.blocks)
-        return h.with_features(self.out_layer(layer_norm(h.features, eps=1e-5)))

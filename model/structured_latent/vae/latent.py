@@ -46,11 +46,6 @@ class SlatVaeConfig:
             raise ModelError("slat vae", f"sizes {self}", expected="positive sizes", action="Correct them.")
         require_heads("slat vae", self.channels, self.heads)
 
-    @property
-    def surface_resolution(self) -> int:
-        """Voxels along an axis of what the surface decoder gives."""
-        return self.resolution * 2 ** len(self.upsample)
-
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SlatDistribution:

@@ -39,7 +39,7 @@ def test_the_closer_square_holds_all_that_was_found(x, y, width, height, margin)
     assert LIMITS.min_side_share <= second.side_px / first.side_px <= LIMITS.max_side_share
     rows, columns = np.nonzero(hand | thing)
     corners = np.array([[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]], np.float64)
-    inside = second.crop_from_image(first.image_from_crop(corners))
+    inside = second.crop.points(first.image_from_crop(corners))
     assert inside.min() >= -1e-9
     assert inside.max() <= SIZE + 1e-9
     # The found box is in the middle, `margin` times smaller than the square.

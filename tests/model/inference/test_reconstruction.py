@@ -27,8 +27,14 @@ def frames(runs) -> VideoFrames:
 
 
 @pytest.fixture(scope="module")
-def result(frames, networks) -> Reconstruction:
-    return reconstruct(frames, networks)
+def clock() -> StageClock:
+    """Of `result`."""
+    return StageClock()
+
+
+@pytest.fixture(scope="module")
+def result(frames, networks, clock) -> Reconstruction:
+    return reconstruct(frames, networks, clock=clock)
 
 
 def arrays(result: Reconstruction) -> Iterator[np.ndarray]:
@@ -41,7 +47,7 @@ def equal(a: Reconstruction, b: Reconstruction) -> bool:
     return all(np.array_equal(x, y) for x, y in zip(arrays(a), arrays(b), strict=True))
 
 
-def test_the_surface_is_a_watertight_and_every_stage_is_timed(result, networks):
+def test_the_surface_is_watertight_and_every_stage_is_timed(result, networks, clock):
     assert result.surface is not None
     assert check_manifold(result.surface.mesh) == result.surface.report
     assert 0 < len(result.voxels) == result.occupancy.sum() < result.occupancy.size
@@ -50,7 +56,7 @@ def test_the_surface_is_a_watertight_and_every_stage_is_timed(result, networks):
     assert result.masks.shape == (4, size, size)
     assert result.masks.min() >= 0
     assert result.masks.max() <= 1
-    assert [name.partition(":")[0] for name in result.seconds] == [
+    assert [name.partition(":")[0] for name in clock.seconds] == [
         "find hand and object",
         "stage 1",
         "stage 2",
@@ -82,13 +88,12 @@ def test_images_in_memory_are_the_same_as_read(result, frames, networks):
         frames_of_images([])
 
 
-def test_chosen_frames_keep_their_boxes(frames, networks):
+def test_frames_are_cropped_to_their_boxes(frames, networks):
     boxes = [np.array([i, 2.0, 32.0 + i, 34.0]) for i in range(len(frames))]
-    settings = replace(STANDARD, views=2, closer_crop=None)
+    settings = replace(STANDARD, closer_crop=None)
     result = reconstruct(frames, replace(networks, stage_two=None), settings, boxes_px=boxes)
-    assert result.choice is not None
-    assert len(result.frames) == len(result.masks) == 2
-    for position, window, crop in zip(result.choice.positions, result.windows, result.crops):
+    assert len(result.masks) == len(boxes)
+    for position, (window, crop) in enumerate(zip(result.windows, result.crops, strict=True)):
         assert window.corner_px == (float(position), 2.0)
         assert crop.origin == "given box"
 

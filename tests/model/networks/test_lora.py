@@ -1,23 +1,14 @@
-"""LoRA: exactly the paper's parameters, no change at the start, merge, and exchange with peft."""
+"""LoRA: exactly the paper's parameters, no change at the start, merge, and what peft reads."""
 
-import copy
 from pathlib import Path
 
 import pytest
 import torch
-from peft import PeftModel
 
 from model.errors import ModelError
-from model.networks.lora import (
-    LoraSettings,
-    add_lora,
-    export_adapter,
-    import_adapter,
-    merge_lora,
-    trainable_parameters,
-)
+from model.networks.lora import LoraSettings, add_lora, export_adapter, merge_lora
 from model.sparse_structure.geometry_branch import GeometryBranch, GeometryBranchConfig
-from tests.model.networks.paper_adapters import paper_adapters
+from tests.model.networks.adapters import paper_adapters, read_by_peft, trainable_parameters
 
 PAPER_LORA = LoraSettings(rank=64, alpha=128, dropout=0.0)
 SMALL_LORA = LoraSettings(rank=3, alpha=6, dropout=0.0)
@@ -111,35 +102,16 @@ def test_merged_weight_is_w_plus_alpha_over_rank_b_a() -> None:
     torch.testing.assert_close(adapted.blocks[1].cross_attn.to_kv.weight, expected)
 
 
-def test_adapter_goes_through_a_folder(tmp_path: Path) -> None:
+def test_peft_reads_an_exported_adapter(tmp_path: Path) -> None:
     adapted = _adapted()
     export_adapter(adapted, tmp_path / "adapter")
     files = {path.name for path in (tmp_path / "adapter").iterdir()}
     assert files == {"adapter_config.json", "adapter_model.safetensors"}
-    fresh = _branch()
-    import_adapter(fresh, tmp_path / "adapter")
-    assert torch.equal(_output(fresh), _output(adapted))
-    assert trainable_parameters(fresh) == trainable_parameters(adapted)
-
-
-def test_peft_itself_reads_the_adapter(tmp_path: Path) -> None:
-    adapted = _adapted()
-    export_adapter(adapted, tmp_path)
-    theirs = PeftModel.from_pretrained(_branch(), str(tmp_path)).base_model.model
+    theirs = read_by_peft(_branch(), tmp_path / "adapter")
     assert torch.equal(_output(theirs), _output(adapted))
+    assert trainable_parameters(theirs) == trainable_parameters(adapted)
 
 
-def test_adapters_that_do_not_fit_are_one_clear_line(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="not found"):
-        import_adapter(_branch(), tmp_path)
-    export_adapter(_adapted(), tmp_path)
-    shallower = copy.deepcopy(_branch())
-    del shallower.blocks[1]
-    with pytest.raises(ModelError, match=r"blocks\.1\.cross_attn") as caught:
-        import_adapter(shallower, tmp_path)
-    assert "\n" not in str(caught.value)
-    (tmp_path / "adapter_model.safetensors").write_bytes(b"torn")
-    with pytest.raises(ModelError, match="safetensors"):
-        import_adapter(_branch(), tmp_path)
+def test_settings_without_meaning_are_refused() -> None:
     with pytest.raises(ModelError, match="rank >= 1"):
         LoraSettings(rank=0, alpha=1, dropout=0.0)

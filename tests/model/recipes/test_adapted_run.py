@@ -8,13 +8,13 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from model.networks.lora import import_adapter
 from model.recipes.components import load_stage_one
 from model.recipes.config import TrainingConfig, load_config
 from model.sparse_structure.geometry_branch import GeometryBranch
 from model.sparse_structure.stage_one import StageOneTask
 from model.weights.weight_file import write_weight_file
 from tests.model.data.balls import write_balls
+from tests.model.networks.adapters import read_by_peft
 from tests.model.small_run import fails, forehoi, small_settings, write_config
 from tests.model.weights.published import write_published
 
@@ -192,8 +192,7 @@ def test_an_exported_adapter_is_that_of_the_averages_and_peft_reads_it(place, tm
     status, output = forehoi("weights", "export-adapter", place / "run", "--out", tmp_path / "adapter")
     assert status == 0, output
     task = load_stage_one(config_of(place), place / "run", CPU)
-    plain = GeometryBranch(config_of(place).stage_one.network.geometry)
-    import_adapter(plain, tmp_path / "adapter")
+    plain = read_by_peft(GeometryBranch(config_of(place).stage_one.network.geometry), tmp_path / "adapter")
     expected = dict(task.network.flow.geometry.named_parameters())
     found = {name: p for name, p in plain.named_parameters() if p.requires_grad}
     assert len(found) == 20

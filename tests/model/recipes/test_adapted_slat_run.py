@@ -8,12 +8,12 @@ import torch
 import yaml
 from safetensors.torch import load_file, save_file
 
-from model.networks.lora import import_adapter
 from model.recipes.slat_components import load_slat_flow
 from model.recipes.slat_config import ImportedSlatVae, SlatTrainingConfig, load_any_config
 from model.structured_latent.flow import SlatFlow
 from model.structured_latent.flow_training import SlatFlowTask
 from model.weights.weight_file import write_weight_file
+from tests.model.networks.adapters import read_by_peft
 from tests.model.small_run import ROOT, fails, forehoi, write_config
 from tests.model.structured_latent.object_features.textured_ball import write_textured_balls
 from tests.model.weights.published_slat import write_published
@@ -143,8 +143,7 @@ def test_merged_weights_are_the_same_function_without_adapters(place: Path, tmp_
 def test_an_exported_adapter_is_that_of_the_averages_and_peft_reads_it(place: Path, tmp_path: Path) -> None:
     status, output = forehoi("weights", "export-adapter", place / "run", "--out", tmp_path / "adapter")
     assert status == 0, output
-    plain = SlatFlow(config_of(place).slat_flow.network)
-    import_adapter(plain, tmp_path / "adapter")
+    plain = read_by_peft(SlatFlow(config_of(place).slat_flow.network), tmp_path / "adapter")
     expected = dict(loaded(place, place / "run").network.flow.named_parameters())
     found = {name: p for name, p in plain.named_parameters() if p.requires_grad}
     assert len(found) == 20

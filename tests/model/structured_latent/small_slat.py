@@ -8,6 +8,7 @@ from torch import nn
 from model.networks.sparse.tensor import SparseTensor
 from model.structured_latent.flow import SlatFlowConfig
 from model.structured_latent.vae.latent import SlatVaeConfig
+from tests.model.networks.sparse.dense import from_dense, from_samples
 
 VAE = SlatVaeConfig(
     feature_channels=10,
@@ -56,12 +57,12 @@ def voxels(fraction: float, channels: int, *, batch: int = 2, resolution: int = 
     generator = torch.Generator().manual_seed(3)
     occupancy = torch.rand(batch, *[resolution] * 3, generator=generator) < fraction
     dense = torch.randn(batch, channels, *[resolution] * 3, generator=generator, dtype=torch.float64)
-    return SparseTensor.from_dense(dense, occupancy)
+    return from_dense(dense, occupancy)
 
 
 def one_sample(x: SparseTensor, sample: int) -> SparseTensor:
     rows = x.grid.batch_index == sample
-    return SparseTensor.from_samples([x.features[rows]], [x.grid.coordinates[rows]], x.grid.resolution)
+    return from_samples([x.features[rows]], [x.grid.coordinates[rows]], x.grid.resolution)
 
 
 def trained(network: nn.Module) -> nn.Module:

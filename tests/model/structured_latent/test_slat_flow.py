@@ -11,19 +11,12 @@ from torch.nn.functional import avg_pool3d, conv3d, interpolate, layer_norm, sil
 from model.errors import ModelError
 from model.flow import preconditioned_velocity
 from model.networks.embeddings import sincos_position_embedding
-from model.networks.lora import (
-    LoraSettings,
-    add_lora,
-    export_adapter,
-    import_adapter,
-    merge_lora,
-    trainable_parameters,
-)
+from model.networks.lora import LoraSettings, add_lora, export_adapter, merge_lora
 from model.networks.sparse.blocks import SparseResBlock3d
-from model.networks.sparse.tensor import SparseTensor
 from model.networks.transformer import ModulatedCrossBlock
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
-from tests.model.networks.paper_adapters import paper_adapters
+from tests.model.networks.adapters import paper_adapters, read_by_peft, trainable_parameters
+from tests.model.networks.sparse.dense import from_dense, from_samples, to_dense
 from tests.model.structured_latent.small_slat import (
     FLOW,
     PAPER_FLOW,
@@ -103,9 +96,9 @@ def _dense_flow(flow: SlatFlow, x: Tensor, t: Tensor, *condition: Tensor) -> Ten
 def test_full_grids_give_the_dense_network(config: SlatFlowConfig, pseudo_count: int) -> None:
     flow = _flow(replace(config, pool_pseudo_count=pseudo_count))
     x, condition = voxels(1.0, 4), _condition(3)
-    expected = _dense_flow(flow, x.to_dense(), *condition)
+    expected = _dense_flow(flow, to_dense(x), *condition)
     # Layer norms and positions are float32 by design.
-    torch.testing.assert_close(flow(x, *condition).to_dense(), expected, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(to_dense(flow(x, *condition)), expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("config", [FLOW, TWO_LEVELS, replace(FLOW, patch=1, io_channels=())])
@@ -144,7 +137,7 @@ def test_a_view_of_weight_zero_is_not_there() -> None:
 def test_order_of_voxels_does_not_matter() -> None:
     flow, x, condition = _flow(TWO_LEVELS), voxels(0.2, 4, batch=1), _condition(2, batch=1)
     order = torch.randperm(x.grid.voxels, generator=torch.Generator().manual_seed(0))
-    shuffled = SparseTensor.from_samples([x.features[order]], [x.grid.coordinates[order]], 8)
+    shuffled = from_samples([x.features[order]], [x.grid.coordinates[order]], 8)
     torch.testing.assert_close(flow(shuffled, *condition).features, flow(x, *condition).features)
 
 
@@ -158,7 +151,7 @@ def test_each_sample_is_alone(config: SlatFlowConfig) -> None:
 def test_empty_samples_are_allowed() -> None:
     occupancy = torch.zeros(2, 8, 8, 8, dtype=torch.bool)
     occupancy[1, 3, 3, 3] = True
-    x = SparseTensor.from_dense(torch.ones(2, 4, 8, 8, 8).double(), occupancy)
+    x = from_dense(torch.ones(2, 4, 8, 8, 8).double(), occupancy)
     assert _flow()(x, *_condition(2)).features.isfinite().all()
 
 
@@ -252,8 +245,7 @@ def test_adapters_start_without_effect_train_merge_and_travel(tmp_path: Path) ->
     assert silent == set()
 
     export_adapter(flow, tmp_path)
-    other = _flow().float()
-    import_adapter(other, tmp_path)
+    other = read_by_peft(_flow().float(), tmp_path)
     assert torch.equal(other(x, *condition).features, adapted)
     merge_lora(flow)
     assert set(flow.state_dict()) == names

@@ -10,7 +10,6 @@ from model.data.batch import Batch
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
 from model.flow import Guidance, SamplerSettings, UniformTime
-from model.networks.sparse.tensor import SparseTensor
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
 from model.structured_latent.flow_training import LATENT, SlatFlowTask, SlatFlowTraining
 from model.structured_latent.mesh_evaluation import MeshEvaluationConfig, mean_scores, scored_mesh
@@ -25,6 +24,7 @@ from model.surface.fields import CHANNELS, CORNERS
 from model.training.step_generators import sample_generators
 from model.training.task import Task
 from tests.model.encoders.mean_color import MeanColor
+from tests.model.networks.sparse.dense import from_samples, occupancy_of
 from tests.model.structured_latent.watertight_shapes import (
     ball,
     ball_distance,
@@ -170,7 +170,7 @@ def test_prediction_is_repeatable_and_lies_on_the_given_voxels(flow_task, batch)
         flow_task.predict(batch.images, batch.occupancy, torch.Generator().manual_seed(3)) for _ in range(2)
     )
     torch.testing.assert_close(a.decoded.features, b.decoded.features, rtol=0, atol=0)
-    assert torch.equal(a.latent.grid.occupancy(), batch.occupancy)
+    assert torch.equal(occupancy_of(a.latent.grid), batch.occupancy)
     fields = a.fields(1)
     assert len(fields.voxels) == int(batch.occupancy[1].sum())
 
@@ -212,7 +212,7 @@ def test_a_pierced_surface_shows_in_its_handles(batch):
     truth = object_surface(batch.true_surface, 0)
 
     def metrics(channels: torch.Tensor) -> dict[str, float]:
-        decoded = SparseTensor.from_samples([channels], [voxels], 64)
+        decoded = from_samples([channels], [voxels], 64)
         return mean_scores([scored_mesh(decoded, 0, truth, MESHES)])
 
     clean = metrics(channels)

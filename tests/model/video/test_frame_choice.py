@@ -138,7 +138,6 @@ def test_record_says_what_decided() -> None:
     assert sorted(choice.rank) == [0, 1, 2]
     assert choice.novelty[choice.rank == 0] == 1.0
     assert ((choice.sharpness >= 0) & (choice.sharpness <= 1)).all()
-    assert choice.n_candidates == 6
 
 
 def test_images_of_mixed_sizes_can_be_compared() -> None:

@@ -26,7 +26,7 @@ def test_mp4_round_trip_for_browsers(tmp_path: Path, size: tuple[int, int]) -> N
     write_mp4([numbered_frame(i, size) for i in range(12)], path, fps=24.0)
     frames = read_frames(path, ALL)
     assert numbers(frames) == list(range(12))
-    np.testing.assert_allclose(frames.times_s, np.arange(12) / 24, atol=1e-3)
+    np.testing.assert_allclose([frame.time_s for frame in frames.frames], np.arange(12) / 24, atol=1e-3)
     assert frames.images[0].shape[:2] == tuple(side + side % 2 for side in size[::-1])
     with av.open(str(path)) as container:
         stream = container.streams.video[0]

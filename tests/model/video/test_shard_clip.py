@@ -1,15 +1,13 @@
-"""A clip of a dataset is read like a video: its images, nothing of its truth unless asked for by name."""
+"""A clip of a dataset is read like a video: its images, nothing of its truth."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from model.data.crop import union_box
 from model.errors import ModelError
 from model.video.frames import ReadLimits
 from model.video.reading import read_frames
-from model.video.shard_clip import annotated_boxes
 from shards.errors import ShardError
 from shards.reader import open_dataset
 from tests.shards.synthetic import synthetic_dataset
@@ -35,7 +33,7 @@ def test_images_are_those_of_the_reader(dataset: Path, place: str) -> None:
     assert frames.n_source_frames == len(frames) == 5
     for index, frame in enumerate(frames.frames):
         np.testing.assert_array_equal(frame.image, truth.rgb(index))
-    np.testing.assert_array_equal(frames.times_s, truth["time_s"])
+    assert [frame.time_s for frame in frames.frames] == truth["time_s"].tolist()
 
 
 def test_limits_and_explicit_frames(dataset: Path) -> None:
@@ -73,14 +71,3 @@ def test_a_file_with_a_hash_in_its_name_is_a_file(tmp_path: Path) -> None:
     (tmp_path / "take#2.mp4").write_bytes(b"")
     with pytest.raises(ModelError, match="0 bytes"):
         read_frames(tmp_path / "take#2.mp4", ALL)
-
-
-def test_annotated_boxes_follow_the_scale(dataset: Path) -> None:
-    clip_id = clip_ids(dataset)[0]
-    full = read_frames(f"{dataset}#{clip_id}", ALL)
-    half = read_frames(f"{dataset}#{clip_id}", ReadLimits(max_frames=64, max_side_px=24))
-    boxes = annotated_boxes(str(dataset), clip_id, full)
-    np.testing.assert_allclose(annotated_boxes(str(dataset), clip_id, half), boxes / 2)
-    truth = open_dataset(dataset).read_frames(clip_id, ("hand_box_visible_px", "object_box_amodal_px"))
-    both = np.stack([truth["hand_box_visible_px"][2], truth["object_box_amodal_px"][2]])
-    np.testing.assert_array_equal(boxes[2], union_box(both, (48, 48)))

@@ -44,8 +44,8 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 def test_both_directions_are_inverse(box: np.ndarray, size: int, points: list[tuple[float, float]]) -> None:
     window = square_window((200, 120), box, size)
     px = np.array(points)
-    np.testing.assert_allclose(window.image_from_crop(window.crop_from_image(px)), px, atol=1e-6)
-    corners = window.crop_from_image(box.reshape(2, 2))
+    np.testing.assert_allclose(window.image_from_crop(window.crop.points(px)), px, atol=1e-6)
+    corners = window.crop.points(box.reshape(2, 2))
     assert corners.min() >= -1e-6
     assert corners.max() <= size + 1e-6
     assert np.isclose((corners[1] - corners[0]).max(), size)  # as small as possible
@@ -101,7 +101,7 @@ def test_box_of_a_second_pass_holds_what_the_first_one_saw(
 ) -> None:
     """A disc is drawn, cropped, found on the crop: the new box is its box times the margin."""
     window = square_window((160, 96), first, size)
-    u, v = window.crop_from_image(np.array(center))
+    u, v = window.crop.points(np.array(center))
     scale = size / window.side_px
     mask = disc((size, size), (float(u), float(v)), radius * scale)
     box = box_from_masks([mask, np.zeros_like(mask)], window, margin)
@@ -115,11 +115,8 @@ def test_box_of_a_second_pass_holds_what_the_first_one_saw(
     np.testing.assert_allclose(box, [*(middle - half), *(middle + half)], atol=margin * pixel + 1e-6)
     again = square_window((160, 96), box, size)
     for point in ((center[0] - radius, center[1]), (center[0] + radius, center[1])):
-        if (
-            window.crop_from_image(np.array(point)).min() > 0
-            and window.crop_from_image(np.array(point)).max() < size
-        ):
-            seen = again.crop_from_image(np.array(point))
+        if window.crop.points(np.array(point)).min() > 0 and window.crop.points(np.array(point)).max() < size:
+            seen = again.crop.points(np.array(point))
             assert -1.5 * size / again.side_px * pixel <= seen.min()
             assert seen.max() <= size + 1.5 * size / again.side_px * pixel
 
@@ -153,7 +150,7 @@ def test_masks_come_back_onto_the_source(
     frame = frame_of(np.zeros((180, 320, 3), np.uint8), source_size)
     box = np.array([center[0] - 80, center[1] - 80, center[0] + 80, center[1] + 80])
     window = square_window(image_size, box, size)
-    u, v = window.crop_from_image(np.array(center))
+    u, v = window.crop.points(np.array(center))
     on_crop = disc((size, size), (float(u), float(v)), radius * size / window.side_px)
     found = mask_on_source(on_crop.astype(np.float32), window, frame)
     truth = disc(source_size, (center[0] * source_scale, center[1] * source_scale), radius * source_scale)
@@ -208,4 +205,4 @@ def test_cropped_image_lies_where_the_window_says() -> None:
         crop, window = square_crop(image, box, 200)
         moments = cv2.moments(crop[0])
         found = np.array([moments["m10"], moments["m01"]]) / moments["m00"] + 0.5
-        np.testing.assert_allclose(found, window.crop_from_image(spot), atol=0.8)
+        np.testing.assert_allclose(found, window.crop.points(spot), atol=0.8)

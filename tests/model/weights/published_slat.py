@@ -8,17 +8,16 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from model.structured_latent.flow import SlatFlow, SlatFlowConfig
-from model.structured_latent.vae.decoder import GaussianDecoder, SurfaceDecoder
+from model.structured_latent.vae.decoder import SurfaceDecoder
 from model.structured_latent.vae.encoder import SlatEncoder
 from model.structured_latent.vae.latent import SlatVaeConfig
 
 FLOW, ENCODER = "slat_flow_img_dit_L_64l8p2", "slat_enc_swin8_B_64l8"
-DECODER, GAUSSIAN = "slat_dec_mesh_swin8_B_64l8m256c", "slat_dec_gs_swin8_B_64l8gs32"
+DECODER = "slat_dec_mesh_swin8_B_64l8m256c"
 CLASSES = {
     FLOW: "SLatFlowModel",
     ENCODER: "SLatEncoder",
     DECODER: "SLatMeshDecoder",
-    GAUSSIAN: "SLatGaussianDecoder",
 }
 
 
@@ -28,7 +27,6 @@ def modules(flow: SlatFlowConfig, vae: SlatVaeConfig) -> dict[str, nn.Module]:
         FLOW: SlatFlow(flow),
         ENCODER: SlatEncoder(vae),
         DECODER: SurfaceDecoder(vae),
-        GAUSSIAN: GaussianDecoder(vae),
     }
 
 
@@ -40,9 +38,7 @@ def write_published(
     generator, written = torch.Generator().manual_seed(0), {}
     for name, module in modules(flow, vae).items():
         tensors = {
-            key: tensor.half()
-            if key == "offset_perturbation"
-            else (std * torch.randn(tensor.shape, generator=generator)).half()
+            key: (std * torch.randn(tensor.shape, generator=generator)).half()
             for key, tensor in module.state_dict().items()
         }
         save_file(tensors, folder / f"{name}_fp16.safetensors")

@@ -11,8 +11,7 @@ from torch import Tensor, nn
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.errors import ModelError
-from model.networks.lora import add_lora, trainable_parameters
-from model.networks.sparse.tensor import SparseTensor
+from model.networks.lora import add_lora
 from model.recipes.slat_config import SlatTrainingConfig, load_any_config
 from model.structured_latent.flow import SlatFlow
 from model.structured_latent.vae.decoder import SurfaceDecoder
@@ -21,7 +20,6 @@ from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.tensor_files.safetensors_file import shapes_of
 from model.weights.published import ImportReport, find_published, import_networks, published_shapes
 from model.weights.slat import (
-    GAUSSIANS,
     SLAT_ENCODER,
     SLAT_FLOW,
     SURFACE,
@@ -30,14 +28,16 @@ from model.weights.slat import (
     trellis_normalisation,
 )
 from model.weights.weight_file import load_weights
+from tests.model.networks.adapters import trainable_parameters
+from tests.model.networks.sparse.dense import from_dense
 from tests.model.structured_latent.small_slat import PAPER_FLOW
 from tests.model.weights import published_slat
 from tests.model.weights.published import refused
-from tests.model.weights.published_slat import DECODER, ENCODER, FLOW, GAUSSIAN, modules
+from tests.model.weights.published_slat import DECODER, ENCODER, FLOW, modules
 
 ROOT = Path(__file__).resolve().parents[3]
 RESEARCH = ROOT.parent / "shared/research/trellis_parameters.json"
-PREFIXES = {FLOW: SLAT_FLOW, ENCODER: SLAT_ENCODER, DECODER: SURFACE, GAUSSIAN: GAUSSIANS}
+PREFIXES = {FLOW: SLAT_FLOW, ENCODER: SLAT_ENCODER, DECODER: SURFACE}
 SMALL_FLOW = replace(
     PAPER_FLOW, resolution=8, channels=16, condition_channels=12, blocks=2, heads=2, io_channels=(8,)
 )
@@ -113,7 +113,9 @@ def test_manifest_and_sizes_repeat_the_research_notes(paper: SlatTrainingConfig)
 
 def test_a_folder_is_imported_and_every_key_listed(tmp_path: Path) -> None:
     written = write_published(tmp_path / "TRELLIS" / "ckpts")
-    save_file({"x": torch.zeros(1)}, tmp_path / "TRELLIS/ckpts/slat_dec_rf_swin8_B_64l8r16_fp16.safetensors")
+    others = ["slat_dec_gs_swin8_B_64l8gs32_fp16.safetensors", "slat_dec_rf_swin8_B_64l8r16_fp16.safetensors"]
+    for name in others:
+        save_file({"x": torch.zeros(1)}, tmp_path / "TRELLIS/ckpts" / name)
     report = run(tmp_path / "TRELLIS", tmp_path / "out.safetensors")
     found = load_file(tmp_path / "out.safetensors")
     of_files = {PREFIXES[name] + key for name in written for key in written[name]}
@@ -122,7 +124,7 @@ def test_a_folder_is_imported_and_every_key_listed(tmp_path: Path) -> None:
         for key, tensor in tensors.items():
             if not key.endswith("skip_connection.conv.weight"):
                 assert torch.equal(found[PREFIXES[name] + key], tensor)
-    assert [path.name for path in report.ignored] == ["slat_dec_rf_swin8_B_64l8r16_fp16.safetensors"]
+    assert [path.name for path in report.ignored] == others
     assert not report.absent
     listed = json.loads(report.key_list.read_text())
     for name, tensors in written.items():
@@ -139,7 +141,7 @@ def test_pointwise_kernels_are_those_that_spconv_multiplied_by(tmp_path: Path) -
     load_weights(tmp_path / "out.safetensors", decoder, group=SURFACE)
     for level, (wide, narrow) in enumerate([(16, 8), (8, 4)]):
         occupancy = torch.rand(1, 4, 4, 4, generator=torch.Generator().manual_seed(0)) < 0.4
-        x = SparseTensor.from_dense(torch.randn(1, wide, 4, 4, 4), occupancy)
+        x = from_dense(torch.randn(1, wide, 4, 4, 4), occupancy)
         weight = written[f"upsample.{level}.skip_connection.conv.weight"].float()
         bias = written[f"upsample.{level}.skip_connection.conv.bias"].float()
         expected = x.features @ weight.view(wide, narrow) + bias
@@ -219,12 +221,12 @@ def test_what_shapes_do_not_say_is_compared_with_the_json(tmp_path: Path) -> Non
 def test_single_files_by_name_or_by_the_json_beside_them(tmp_path: Path) -> None:
     write_published(tmp_path)
     report = run(tmp_path / f"{DECODER}_fp16.safetensors", tmp_path / "a.safetensors")
-    assert set(report.absent) == {FLOW, ENCODER, GAUSSIAN}
+    assert set(report.absent) == {FLOW, ENCODER}
     for suffix in ("safetensors", "json"):
-        (tmp_path / f"{GAUSSIAN}_fp16.{suffix}").rename(tmp_path / f"mine.{suffix}")
+        (tmp_path / f"{ENCODER}_fp16.{suffix}").rename(tmp_path / f"mine.{suffix}")
     networks = slat_networks(SMALL_FLOW, SMALL_VAE)
     found = find_published(tmp_path / "mine.safetensors", networks).found
-    assert found == {GAUSSIAN: tmp_path / "mine.safetensors"}
+    assert found == {ENCODER: tmp_path / "mine.safetensors"}
     (tmp_path / "mine.json").unlink()
     fails(
         tmp_path / "mine.safetensors",
@@ -243,10 +245,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         "holds none of the published networks among 0",
         "Download from TRELLIS-image-large/ckpts",
     )
-    written = write_published(tmp_path)
-    wrong = written[GAUSSIAN] | {"offset_perturbation": written[GAUSSIAN]["offset_perturbation"].flip(0)}
-    save_file(wrong, tmp_path / f"{GAUSSIAN}_fp16.safetensors")
-    fails(tmp_path, out, "offset_perturbation differs")
+    write_published(tmp_path)
     (tmp_path / f"{FLOW}_fp16.json").write_text('{"name": "SparseStructureFlowModel", "args": {}}')
     fails(tmp_path, out, "is a SparseStructureFlowModel", "expected SLatFlowModel")
     (tmp_path / f"{FLOW}_bf16.safetensors").write_bytes(b"")

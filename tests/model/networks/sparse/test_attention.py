@@ -18,6 +18,7 @@ from model.networks.sparse.backends import uses_packed_attention
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.sequences import Window
 from model.networks.sparse.tensor import SparseTensor
+from tests.model.networks.sparse.dense import from_dense
 
 _WINDOWS = [None, Window(size=4, shift=0), Window(size=4, shift=2), Window(size=3, shift=1)]
 
@@ -29,7 +30,7 @@ def _seed() -> None:
 
 def _tensor(fraction: float, channels: int = 12) -> SparseTensor:
     occupancy = torch.rand(2, 8, 8, 8) < fraction
-    return SparseTensor.from_dense(torch.randn(2, channels, 8, 8, 8), occupancy)
+    return from_dense(torch.randn(2, channels, 8, 8, 8), occupancy)
 
 
 def _sees(grid: SparseGrid, window: Window | None) -> torch.Tensor:

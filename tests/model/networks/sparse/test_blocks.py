@@ -17,6 +17,7 @@ from model.networks.sparse.transformer import (
     shifted_windows,
 )
 from model.networks.transformer import ModulatedCrossBlock, initialise_transformer
+from tests.model.networks.sparse.dense import from_dense, from_samples, occupancy_of, to_dense
 
 
 @pytest.fixture(autouse=True)
@@ -26,7 +27,7 @@ def _seed() -> None:
 
 def _tensor(fraction: float, channels: int = 8, resolution: int = 6) -> SparseTensor:
     occupancy = torch.rand(2, *[resolution] * 3) < fraction
-    x = SparseTensor.from_dense(torch.randn(2, channels, *[resolution] * 3), occupancy)
+    x = from_dense(torch.randn(2, channels, *[resolution] * 3), occupancy)
     return x.with_features(x.features.requires_grad_())
 
 
@@ -52,18 +53,18 @@ def _same_gradients(x: SparseTensor, ours: Tensor, expected: Tensor) -> None:
 @pytest.mark.parametrize("factor", [2, 3])
 def test_mean_pool_and_back_are_the_dense_operations(fraction: float, factor: int) -> None:
     x = _tensor(fraction)
-    occupancy = x.grid.occupancy()
+    occupancy = occupancy_of(x.grid)
     count = avg_pool3d(occupancy.float()[:, None], factor) * factor**3
-    dense = avg_pool3d(x.to_dense(), factor) * factor**3 / count.clamp(min=1)
+    dense = avg_pool3d(to_dense(x), factor) * factor**3 / count.clamp(min=1)
     pooled = mean_pool(x, factor, pseudo_count=0)
-    _close(pooled.to_dense(), dense)
-    assert torch.equal(pooled.grid.occupancy(), count[:, 0] > 0)
+    _close(to_dense(pooled), dense)
+    assert torch.equal(occupancy_of(pooled.grid), count[:, 0] > 0)
 
     ours = unpool(pooled, x.grid)
     assert ours.grid is x.grid
     expected = interpolate(dense, scale_factor=factor) * occupancy[:, None]
-    _close(ours.to_dense(), expected)
-    _same_gradients(x, ours.to_dense(), expected)
+    _close(to_dense(ours), expected)
+    _same_gradients(x, to_dense(ours), expected)
 
 
 def test_published_pooling_counts_a_zero_more() -> None:
@@ -108,16 +109,16 @@ def _per_voxel(layer: nn.Module, x: Tensor) -> Tensor:
 @pytest.mark.parametrize("out_channels", [8, 12])
 def test_residual_block_is_the_dense_one(fraction: float, out_channels: int) -> None:
     block, x = _awake(SparseResBlock3d(8, out_channels, 5)), _tensor(fraction)
-    t_embedding, occupancy = torch.randn(2, 5), x.grid.occupancy()
+    t_embedding, occupancy = torch.randn(2, 5), occupancy_of(x.grid)
     scale, shift = block.emb_layers(t_embedding)[:, :, None, None, None].chunk(2, dim=1)
-    h = silu(_per_voxel(block.norm1, x.to_dense())) * occupancy[:, None]
+    h = silu(_per_voxel(block.norm1, to_dense(x))) * occupancy[:, None]
     h = _dense_conv(block.conv1, h, occupancy)
     h = _per_voxel(lambda y: nn.functional.layer_norm(y, y.shape[-1:], eps=1e-6), h)
     h = silu(h * (1 + scale) + shift) * occupancy[:, None]
-    expected = _dense_conv(block.conv2, h, occupancy) + _per_voxel(block.skip_connection, x.to_dense())
+    expected = _dense_conv(block.conv2, h, occupancy) + _per_voxel(block.skip_connection, to_dense(x))
     ours = block(x, t_embedding)
-    _close(ours.features, SparseTensor.from_dense(expected, occupancy).features)
-    _same_gradients(x, ours.features, SparseTensor.from_dense(expected, occupancy).features)
+    _close(ours.features, from_dense(expected, occupancy).features)
+    _same_gradients(x, ours.features, from_dense(expected, occupancy).features)
 
 
 @pytest.mark.parametrize("out_channels", [8, 4])
@@ -126,20 +127,20 @@ def test_subdivide_block_is_the_dense_one_on_full_grids(out_channels: int) -> No
     norm_in, norm_out = block.act_layers[0], block.out_layers[1]
     first, last = block.out_layers[0], block.out_layers[3]
     everywhere = torch.ones(2, 8, 8, 8, dtype=torch.bool)
-    up = interpolate(silu(group_norm(x.to_dense(), 2, norm_in.weight, norm_in.bias)), scale_factor=2)
+    up = interpolate(silu(group_norm(to_dense(x), 2, norm_in.weight, norm_in.bias)), scale_factor=2)
     h = group_norm(_dense_conv(first, up, everywhere), 2, norm_out.weight, norm_out.bias)
     h = _dense_conv(last, silu(h), everywhere)
-    skip = interpolate(x.to_dense(), scale_factor=2)
+    skip = interpolate(to_dense(x), scale_factor=2)
     if isinstance(block.skip_connection, SparseConv3d):
         skip = _dense_conv(block.skip_connection, skip, everywhere)
-    ours = block(x).to_dense()
+    ours = to_dense(block(x))
     _close(ours, h + skip)
     _same_gradients(x, ours, h + skip)
 
 
 def test_subdivide_gives_the_children_the_features() -> None:
     x = _tensor(0.3)
-    _close(subdivide(x).to_dense(), interpolate(x.to_dense(), scale_factor=2))
+    _close(to_dense(subdivide(x)), interpolate(to_dense(x), scale_factor=2))
 
 
 def test_blocks_start_as_their_skip() -> None:
@@ -172,7 +173,7 @@ def test_modulated_block_treats_each_sample_alone(window: Window | None) -> None
     alone = []
     for sample in range(2):
         rows = x.grid.batch_index == sample
-        one = SparseTensor.from_samples([x.features[rows]], [x.grid.coordinates[rows]], 6)
+        one = from_samples([x.features[rows]], [x.grid.coordinates[rows]], 6)
         at = slice(sample, sample + 1)
         alone.append(block(one, t_embedding[at], contexts[at], weights[at]).features)
     _close(together, torch.cat(alone))
@@ -188,7 +189,7 @@ def test_equal_views_count_as_one() -> None:
 def test_a_stack_of_blocks_takes_empty_samples() -> None:
     occupancy = torch.zeros(2, 4, 4, 4, dtype=torch.bool)
     for _ in range(2):
-        x = SparseTensor.from_dense(torch.randn(2, 12, 4, 4, 4), occupancy)
+        x = from_dense(torch.randn(2, 12, 4, 4, 4), occupancy)
         h = SparseTransformerBlock(channels=12, heads=3, mlp_ratio=2, window=Window(size=2, shift=1))(x)
         h = _modulated()(h, torch.randn(2, 12), torch.randn(2, 3, 5, 7), torch.full((2, 3), 1 / 3))
         h = unpool(mean_pool(h, 2, pseudo_count=1), h.grid)

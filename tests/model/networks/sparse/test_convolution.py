@@ -15,6 +15,7 @@ from model.networks.sparse.convolution import (
 )
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.tensor import SparseTensor
+from tests.model.networks.sparse.dense import from_dense, occupancy_of, to_dense
 
 
 @pytest.fixture(autouse=True)
@@ -24,7 +25,7 @@ def _seed() -> None:
 
 def _tensor(fraction: float, channels: int = 5, resolution: int = 6) -> SparseTensor:
     occupancy = torch.rand(2, *[resolution] * 3) < fraction
-    return SparseTensor.from_dense(torch.randn(2, channels, *[resolution] * 3), occupancy)
+    return from_dense(torch.randn(2, channels, *[resolution] * 3), occupancy)
 
 
 def _dense(layer: SparseConv3d, volumes: torch.Tensor, occupancy: torch.Tensor) -> torch.Tensor:
@@ -38,15 +39,15 @@ def _dense(layer: SparseConv3d, volumes: torch.Tensor, occupancy: torch.Tensor) 
 def test_values_and_gradients_are_those_of_conv3d(fraction: float, kernel: int) -> None:
     layer, x = SparseConv3d(5, 7, kernel), _tensor(fraction)
     features = x.features.clone().requires_grad_()
-    ours = layer(x.with_features(features)).to_dense()
-    volumes = x.to_dense().requires_grad_()
-    dense = _dense(layer, volumes, x.grid.occupancy())
+    ours = to_dense(layer(x.with_features(features)))
+    volumes = to_dense(x).requires_grad_()
+    dense = _dense(layer, volumes, occupancy_of(x.grid))
     torch.testing.assert_close(ours, dense, atol=1e-5, rtol=1e-5)
 
     upstream = torch.randn_like(dense)
     grads = torch.autograd.grad((ours * upstream).sum(), [features, *layer.parameters()])
     expected = torch.autograd.grad((dense * upstream).sum(), [volumes, *layer.parameters()])
-    at_voxels = SparseTensor.from_dense(expected[0], x.grid.occupancy()).features
+    at_voxels = from_dense(expected[0], occupancy_of(x.grid)).features
     torch.testing.assert_close(grads[0], at_voxels, atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(grads[1:], expected[1:], atol=1e-4, rtol=1e-5)
 
@@ -66,8 +67,8 @@ def test_work_in_steps_is_the_same(shell: Callable[[int], SparseGrid]) -> None:
     grid = shell(64)
     layer, x = SparseConv3d(2, 3, 3), SparseTensor(grid=grid, features=torch.randn(grid.voxels, 2))
     assert max(len(rows) for rows, _ in grid.neighbours(3).before_middle) > 8192
-    dense = _dense(layer, x.to_dense(), grid.occupancy())
-    torch.testing.assert_close(layer(x).to_dense(), dense, atol=1e-5, rtol=1e-5)
+    dense = _dense(layer, to_dense(x), occupancy_of(grid))
+    torch.testing.assert_close(to_dense(layer(x)), dense, atol=1e-5, rtol=1e-5)
 
 
 def test_samples_do_not_see_each_other() -> None:

@@ -13,6 +13,7 @@ from model.networks.sparse.embeddings import voxel_position_embedding
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.sequences import Window
 from model.networks.sparse.tensor import SparseTensor
+from tests.model.networks.sparse.dense import from_dense, from_samples, occupancy_of, to_dense
 
 
 def _occupancy(seed: int, batch: int, resolution: int, fraction: float) -> torch.Tensor:
@@ -37,34 +38,33 @@ def _rows(grid: SparseGrid) -> list[tuple[int, ...]]:
 @given(occupancies)
 def test_dense_and_back(occupancy: torch.Tensor) -> None:
     dense = torch.randn(len(occupancy), 2, *occupancy.shape[1:]) * occupancy[:, None]
-    x = SparseTensor.from_dense(dense, occupancy)
-    assert torch.equal(x.to_dense(), dense)
-    assert torch.equal(x.grid.occupancy(), occupancy)
+    x = from_dense(dense, occupancy)
+    assert torch.equal(to_dense(x), dense)
+    assert torch.equal(occupancy_of(x.grid), occupancy)
     assert x.grid.sample_sizes == tuple(occupancy.sum((1, 2, 3)).tolist())
     assert _rows(x.grid) == sorted(_rows(x.grid))
 
 
 @settings(max_examples=20, deadline=None)
 @given(occupancies, st.randoms(use_true_random=False))
-def test_any_order_of_input_gives_the_same_tensor(occupancy: torch.Tensor, random: object) -> None:
-    x = SparseTensor.from_dense(torch.randn(len(occupancy), 3, *occupancy.shape[1:]), occupancy)
+def test_any_order_of_input_gives_the_same_grid(occupancy: torch.Tensor, random: object) -> None:
+    x = from_dense(torch.randn(len(occupancy), 3, *occupancy.shape[1:]), occupancy)
     order = list(range(x.grid.voxels))
     random.shuffle(order)  # type: ignore[attr-defined]
     index = torch.tensor(order, dtype=torch.long)
-    y = SparseTensor.from_rows(
-        features=x.features[index],
+    grid, row_of_input = SparseGrid.from_coordinates(
         coordinates=x.grid.coordinates[index].int(),
         batch_index=x.grid.batch_index[index].int(),
         batch_size=x.grid.batch_size,
         resolution=x.grid.resolution,
     )
-    assert y.grid.same_voxels(x.grid)
-    assert torch.equal(y.features, x.features)
+    assert grid.same_voxels(x.grid)
+    assert torch.equal(x.features[index][row_of_input], x.features)
 
 
 def test_samples_are_collated() -> None:
     a, b, none = torch.tensor([[3, 0, 0], [0, 1, 2]]), torch.tensor([[1, 1, 1]]), torch.zeros(0, 3).long()
-    x = SparseTensor.from_samples(
+    x = from_samples(
         [torch.tensor([[3.0], [0.0]]), torch.zeros(0, 1), torch.tensor([[7.0]])], [a, none, b], 4
     )
     assert _rows(x.grid) == [(0, 0, 1, 2), (0, 3, 0, 0), (2, 1, 1, 1)]
@@ -164,7 +164,7 @@ def test_coarser_and_finer_grids(occupancy: torch.Tensor) -> None:
     fine = occupancy
     for axis in (1, 2, 3):
         fine = fine.repeat_interleave(2, dim=axis)
-    assert torch.equal(subdivision.fine.occupancy(), fine)
+    assert torch.equal(occupancy_of(subdivision.fine), fine)
     assert torch.equal(subdivision.fine.coordinates // 2, grid.coordinates[subdivision.parent])
 
     back = subdivision.fine.coarsened(2)

@@ -14,16 +14,16 @@ from model.networks.embeddings import sincos_position_embedding
 from model.networks.sparse.grid import SparseGrid
 from model.networks.sparse.resampling import subdivide
 from model.networks.sparse.tensor import SparseTensor
-from model.structured_latent.vae.decoder import GaussianDecoder, SurfaceDecoder
+from model.structured_latent.vae.decoder import SurfaceDecoder
 from model.structured_latent.vae.encoder import SlatEncoder
 from model.structured_latent.vae.latent import SlatVaeConfig
 from model.surface.fields import CHANNELS, split_channels
+from tests.model.networks.sparse.dense import from_dense, from_samples
 from tests.model.structured_latent.small_slat import VAE, one_sample, trained, voxels, without_gradient
 
 NETWORKS: list[tuple[Callable[[SlatVaeConfig], nn.Module], int]] = [
     (SlatEncoder, VAE.feature_channels),
     (SurfaceDecoder, VAE.latent_channels),
-    (GaussianDecoder, VAE.latent_channels),
 ]
 
 
@@ -63,14 +63,12 @@ def test_encoder_is_masked_dense_attention(fraction: float) -> None:
     assert found.mean.grid is x.grid
 
 
-def test_decoders_are_masked_dense_attention() -> None:
+def test_surface_decoder_is_masked_dense_attention() -> None:
     x = voxels(0.3, VAE.latent_channels, batch=1)
     flat = replace(VAE, upsample=())
-    surface, gaussian = trained(SurfaceDecoder(flat)), trained(GaussianDecoder(VAE))
+    surface = trained(SurfaceDecoder(flat))
     expected = surface.out_layer(_dense_trunk(surface, x, flat))
     torch.testing.assert_close(surface(x).features, expected, atol=1e-5, rtol=1e-5)
-    expected = gaussian.out_layer(layer_norm(_dense_trunk(gaussian, x, VAE), (VAE.channels,)))
-    torch.testing.assert_close(gaussian(x).features, expected, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("upsample", [(), (16,), (16, 8)])
@@ -81,10 +79,10 @@ def test_surface_decoder_divides_every_voxel(upsample: tuple[int, ...]) -> None:
     children = x.with_features(torch.zeros(x.grid.voxels, 1))
     for _ in upsample:
         children = subdivide(children)
-    assert out.grid.resolution == config.surface_resolution
+    assert out.grid.resolution == config.resolution * 2 ** len(upsample)
     assert torch.equal(out.grid.keys, children.grid.keys)
     assert out.features.shape[1] == CHANNELS
-    split_channels(out.features, config.surface_resolution)
+    split_channels(out.features, out.grid.resolution)
 
 
 @pytest.mark.parametrize(("build", "channels"), NETWORKS)
@@ -98,7 +96,7 @@ def test_each_sample_is_alone(build: Callable[[SlatVaeConfig], nn.Module], chann
 def test_order_of_voxels_does_not_matter(build: Callable[[SlatVaeConfig], nn.Module], channels: int) -> None:
     network, x = trained(build(VAE)), voxels(0.2, channels, batch=1)
     order = torch.randperm(x.grid.voxels, generator=torch.Generator().manual_seed(0))
-    shuffled = SparseTensor.from_samples([x.features[order]], [x.grid.coordinates[order]], 8)
+    shuffled = from_samples([x.features[order]], [x.grid.coordinates[order]], 8)
     torch.testing.assert_close(_features(network(shuffled)), _features(network(x)))
 
 
@@ -142,10 +140,10 @@ def test_bfloat16_stays_close(
 @pytest.mark.parametrize(("build", "channels"), NETWORKS)
 def test_empty_samples_are_allowed(build: Callable[[SlatVaeConfig], nn.Module], channels: int) -> None:
     network, occupancy = trained(build(VAE)), torch.zeros(2, 8, 8, 8, dtype=torch.bool)
-    nothing = network(SparseTensor.from_dense(torch.zeros(2, channels, 8, 8, 8).double(), occupancy))
+    nothing = network(from_dense(torch.zeros(2, channels, 8, 8, 8).double(), occupancy))
     assert len(_features(nothing)) == 0
     occupancy[1, 0, 1, 2] = True
-    out = network(SparseTensor.from_dense(torch.ones(2, channels, 8, 8, 8).double(), occupancy))
+    out = network(from_dense(torch.ones(2, channels, 8, 8, 8).double(), occupancy))
     assert _features(out).isfinite().all()
 
 

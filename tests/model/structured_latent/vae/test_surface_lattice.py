@@ -13,6 +13,7 @@ from model.structured_latent.vae.surface_lattice import DecodedLattice, decoded_
 from model.surface.extraction import ExtractionConfig, extract_surface
 from model.surface.fields import CHANNELS
 from model.surface.lattice import corner_lattice
+from tests.model.networks.sparse.dense import from_samples
 
 RESOLUTION = 8
 
@@ -106,9 +107,7 @@ def test_samples_of_a_batch_do_not_meet():
     points = torch.full((1, 3), 0.05)
     for sample in (0, 1):
         rows = grid.batch_index == sample
-        alone = decoded_lattice(
-            SparseTensor.from_samples([features[rows]], [grid.coordinates[rows]], RESOLUTION)
-        )
+        alone = decoded_lattice(from_samples([features[rows]], [grid.coordinates[rows]], RESOLUTION))
         a = both.at(points, torch.tensor([sample])).distance
         torch.testing.assert_close(a, alone.at(points, torch.tensor([0])).distance)
 

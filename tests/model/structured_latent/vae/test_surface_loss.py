@@ -12,6 +12,7 @@ from model.structured_latent.object_features.surface_features import object_feat
 from model.structured_latent.vae.latent import SlatDistribution
 from model.structured_latent.vae.surface_loss import SurfaceLoss, SurfaceLossConfig, surface_loss
 from model.surface.fields import CHANNELS, CORNERS
+from tests.model.networks.sparse.dense import from_samples
 from tests.model.structured_latent.watertight_shapes import ball, ball_distance, shell
 
 RESOLUTION = 64
@@ -22,7 +23,7 @@ CONFIG = SurfaceLossConfig(
 
 def coarse(radius: float) -> SparseTensor:
     voxels = torch.from_numpy(np.argwhere(shell(ball_distance(radius))))
-    return SparseTensor.from_samples([torch.zeros(len(voxels), 4)], [voxels], RESOLUTION)
+    return from_samples([torch.zeros(len(voxels), 4)], [voxels], RESOLUTION)
 
 
 def true_channels(x: SparseTensor, radius: float, levels: int) -> SparseTensor:
@@ -102,8 +103,8 @@ def test_each_sample_stands_for_itself():
         def pick(values):
             return [values[i] for i in chosen]
 
-        latent = SparseTensor.from_samples(pick(latents), pick(coordinates), RESOLUTION)
-        decoded = SparseTensor.from_samples(pick(rows), pick(coordinates), RESOLUTION)
+        latent = from_samples(pick(latents), pick(coordinates), RESOLUTION)
+        decoded = from_samples(pick(rows), pick(coordinates), RESOLUTION)
         truth = join_surfaces(pick(surfaces), ["a", "b"][: len(chosen)])
         distribution = SlatDistribution(mean=latent, logvar=latent)
         return surface_loss(decoded, distribution, truth, torch.cat(pick(estimates)), CONFIG)
