@@ -146,12 +146,15 @@ def test_saved_and_loaded_again(tmp_path: Path, dtype: torch.dtype) -> None:
 
 
 def test_missing_weights_name_the_command(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match=r"there is no hand_encoder\.json.*`forehoi train hand_encoder`"):
+    with pytest.raises(
+        ModelError, match=r"there is no hand_encoder\.json.*`forehoi train hand_encoder --config hands`"
+    ):
         load_hand_net(tmp_path)
     save_hand_net(network(), tmp_path, dtype=torch.float32)
     (tmp_path / "hand_encoder.safetensors").unlink()
     with pytest.raises(
-        ModelError, match=r"there is no hand_encoder\.safetensors.*`forehoi train hand_encoder`"
+        ModelError,
+        match=r"there is no hand_encoder\.safetensors.*`forehoi train hand_encoder --config hands`",
     ):
         load_hand_net(tmp_path)
 

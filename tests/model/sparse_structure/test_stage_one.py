@@ -24,9 +24,7 @@ from tests.model.encoders.mean_color import MeanColor
 @pytest.fixture
 def task() -> StageOneTask:
     torch.manual_seed(0)
-    vae = VaeConfig(
-        patch=1, channels=(4, 4, 8, 8), latent_channels=4, residual_blocks=(1, 1, 1, 1), middle_blocks=1
-    )
+    vae = VaeConfig(patch=4, channels=(8, 8), latent_channels=4, residual_blocks=(1, 1), middle_blocks=1)
     flow = DualBranchConfig(
         geometry=GeometryBranchConfig(
             latent_resolution=8,
