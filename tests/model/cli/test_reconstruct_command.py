@@ -164,4 +164,4 @@ def test_what_the_command_line_gets_wrong(runs, tmp_path, arguments, expected):
 def test_frames_and_boxes_that_do_not_exist(runs, video, tmp_path):
     assert "frame 12 does not exist" in refused(runs, tmp_path, video, "--frames", "0,12")
     assert "outside of the image" in refused(runs, tmp_path, video, "--box", "200,0,300,90")
-    assert "no clip" in refused(runs, tmp_path, f"{runs.dataset}#nothing")
+    assert "no such clip" in refused(runs, tmp_path, f"{runs.dataset}#nothing")
