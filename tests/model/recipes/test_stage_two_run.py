@@ -192,5 +192,5 @@ def test_contradictions_name_both_sides(config):
         parse_config(yaml.safe_dump(bad), where="file")
     with pytest.raises(SettingsError, match="slat_flo"):
         parse_config(text.replace("slat_flow:", "slat_flo:"), where="file")
-    with pytest.raises(ModelError, match="does not exist"):
+    with pytest.raises(SettingsError, match="no such configuration"):
         load_config(FOLDER / "nothing.yaml")
