@@ -60,7 +60,8 @@ def stage_synthetic(
     change_frame: Callable[[FrameRow], FrameRow] = lambda frame: frame,
 ) -> MotionRecord:
     object_row = synthetic_object(motion_index % 2)
-    clips, frames = [], []
+    clips: list[ClipRow] = []
+    frames: list[FrameRow] = []
     for camera_index in range(cameras):
         clip, clip_frames = synthetic_clip(object_row, motion_index, camera_index, n_frames, size_px)
         clips.append(clip)
