@@ -112,9 +112,7 @@ class Batch:
     joints_px: Float[torch.Tensor, "batch view 21 2"]  # NaN behind the camera
     is_right: Bool[torch.Tensor, " batch"]
     ids: tuple[str, ...]  # "motion_id:epoch:position", one per sample
-    views: tuple[
-        tuple[str, ...], ...
-    ] = ()  # "clip_id frame N" of each view of each sample; empty: not of a shard
+    views: tuple[tuple[str, ...], ...] = ()  # "clip_id frame N" of each view, by sample; empty: of no shard
     surface: SurfaceBatch | None = None  # read only where StreamConfig.surface asks for it
 
     @property
