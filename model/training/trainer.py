@@ -1,4 +1,4 @@
-"""The training loop: one process or many, exact resume, SIGTERM saves, NaN stops with names.
+"""The training loop: one process or many, exact resume on a CPU, SIGTERM saves, NaN stops with names.
 
 Gradients are averaged over ranks by one reduction per step instead of a wrapper around the module,
 so that a Task may call its networks as it likes. With equal global batches the result does not
