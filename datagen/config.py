@@ -21,8 +21,9 @@ from datagen.sources.hands import HandConfig, resolved_hand
 from datagen.sources.motions import MotionsConfig
 from datagen.sources.objects import ObjectsConfig
 from datagen.version import generator_commit
-from shards.configuration.layers import Replacement, read_layers
-from shards.settings import SettingsError, settings_from_dict
+from shards.configuration.layers import read_layers
+from shards.configuration.strict_yaml import parse_yaml
+from shards.settings import settings_from_dict
 from shards.splits import SplitRule
 from shards.storage.records import Provenance
 
@@ -88,30 +89,13 @@ def read_config(name: str | Path) -> DatasetConfig:
 
     SettingsError names file, key, expected and found.
     """
-    merged = read_layers(name, PRESETS, _parsed)
+    merged = read_layers(name, PRESETS, parse_yaml)
     config = settings_from_dict(DatasetConfig, merged.data, where=merged.origins)
     selection = config.selection
     if selection.takedown is not None:
         beside = Path(merged.origins["selection.takedown"]).parent
         selection = replace(selection, takedown=(beside / selection.takedown.expanduser()).resolve())
     return replace(config, selection=selection)
-
-
-class _Loader(yaml.SafeLoader):
-    """Plain content and `!replace`."""
-
-    def replacement(self, node: yaml.Node) -> Replacement:
-        return Replacement(self.construct_mapping(node, deep=True))  # type: ignore[arg-type]  # refuses others itself
-
-
-_Loader.add_constructor("!replace", _Loader.replacement)
-
-
-def _parsed(text: str, where: str) -> object:
-    try:
-        return yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error
 
 
 def config_as_yaml(config: DatasetConfig) -> str:

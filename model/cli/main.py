@@ -14,9 +14,11 @@ from model.cli.reconstruct import reconstruct_command
 from model.cli.weights import weights
 from model.errors import ModelError
 from model.recipes.components.component import Component
-from model.recipes.config import COMPONENT_NAMES, TrainingConfig, load_config
+from model.recipes.config import COMPONENT_NAMES, PRESETS, TrainingConfig, load_config
 from model.recipes.train_component import train_component
 from model.training.progress import TrainingProgress
+from shards.configuration.presets import preset_names
+from shards.settings import did_you_mean
 
 __all__ = ["main"]
 
@@ -69,6 +71,8 @@ def train(what: str, config_name: str, out: Path | None) -> None:
       forehoi train hand_encoder --config hands
     """
     is_component = what in COMPONENT_NAMES
+    if not is_component:
+        _refuse_unknown_name(what)
     name_or_file = config_name if is_component else what
     config = load_config(name_or_file)
     components = (_component(config, what, name_or_file),) if is_component else _to_train(config)
@@ -82,6 +86,18 @@ def train(what: str, config_name: str, out: Path | None) -> None:
             )
     if accelerator.is_main_process:
         Console().print(_table(config, metrics, folder))
+
+
+def _refuse_unknown_name(what: str) -> None:
+    """A name without slash and suffix is that of a preset or of a component."""
+    presets = preset_names(PRESETS)
+    if "/" not in what and not Path(what).suffix and what not in presets:
+        raise ModelError(
+            what,
+            f"neither a preset nor a component{did_you_mean(what, (*COMPONENT_NAMES, *presets))}",
+            expected=f"a preset ({', '.join(presets)}) or a component ({', '.join(COMPONENT_NAMES)})",
+            action=f"Correct it, or name a file with its suffix or a slash: {what}.yaml, ./{what}",
+        )
 
 
 def _to_train(config: TrainingConfig) -> tuple[Component, ...]:

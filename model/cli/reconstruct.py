@@ -4,18 +4,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import click
+import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
 
 from model.cli.options import plain_errors
 from model.errors import ModelError
+from model.evaluation.surface import SurfaceScore, surface_score
+from model.inference.clip_truth import clip_truth
 from model.inference.held_out import held_out_clip
 from model.inference.networks import StageOneRun, StageTwoRun, load_networks, open_stage_one, open_stage_two
 from model.inference.reconstruction import STANDARD, Reconstruction, reconstruct
 from model.inference.record import write_record
 from model.inference.result_files import write_result
-from model.inference.scale import known_scale
 from model.inference.stage_clock import StageClock
 from model.video.frame_choice import FrameChoice
 from model.video.frames import ReadLimits, VideoFrames
@@ -26,6 +28,7 @@ from model.video.staged_folder import staged_folder
 __all__ = ["reconstruct_command"]
 
 _CANDIDATES = ReadLimits(max_frames=64, max_side_px=512)  # among which frames are chosen
+_METRIC_POINTS = 30_000  # on the mesh
 _MAX_SIDE_PX = 2048  # of the frames that are used; larger ones are scaled down
 
 
@@ -136,12 +139,12 @@ def reconstruct_command(
         )
         with Console(stderr=True).status("") as status:  # in a terminal
             clock = StageClock(status.update)
-            result = _run(request, folder, clock)
-    _print(result, out, clock)
+            result, score = _run(request, folder, clock)
+    _print(result, score, out, clock)
 
 
-def _run(request: _Request, folder: Path, clock: StageClock) -> Reconstruction:
-    """Reads, reconstructs and writes."""
+def _run(request: _Request, folder: Path, clock: StageClock) -> tuple[Reconstruction, SurfaceScore | None]:
+    """Reads, reconstructs, compares with the truth where a dataset has it, and writes."""
     with clock.stage("read frames"):
         frames, choice = _read(request)
         boxes = None if request.box is None else [parsed_box(request.box, f) for f in frames.frames]
@@ -151,15 +154,19 @@ def _run(request: _Request, folder: Path, clock: StageClock) -> Reconstruction:
     result = reconstruct(frames, networks, settings, boxes_px=boxes, clock=clock)
     with clock.stage("write images and meshes"):
         write_result(result, folder)
+    truth, score = clip_truth(frames), None
+    if truth is not None and result.surface is not None:
+        score = surface_score(result.surface.mesh, truth, _METRIC_POINTS, np.random.default_rng(0))
     write_record(
         folder,
         result,
         networks,
         choice=choice,
-        scale=known_scale(frames),
+        truth=truth,
+        score=score,
         seconds=clock.seconds,
     )
-    return result
+    return result, score
 
 
 def _read(request: _Request) -> tuple[VideoFrames, FrameChoice | None]:
@@ -198,8 +205,8 @@ def _device(name: str) -> torch.device:
     return device
 
 
-def _print(result: Reconstruction, out: Path, clock: StageClock) -> None:
-    """Where to look, how long it took, and what the user should know."""
+def _print(result: Reconstruction, score: SurfaceScore | None, out: Path, clock: StageClock) -> None:
+    """Where to look, how long it took, how good it is, and what the user should know."""
     table = Table(title=f"{result.frames.source}", title_justify="left", show_footer=True)
     table.add_column("stage", footer="together")
     table.add_column("seconds", justify="right", footer=f"{sum(clock.seconds.values()):.1f}")
@@ -215,5 +222,12 @@ def _print(result: Reconstruction, out: Path, clock: StageClock) -> None:
         report = result.surface.report
         console.print(
             f"mesh: {report.faces} faces, watertight, {report.components} component(s)", soft_wrap=True
+        )
+    if score is not None:
+        console.print(
+            f"against the clip's true surface, without alignment: chamfer {score.points.chamfer_cm:.2f} cm, "
+            f"F-score {score.points.f_5mm:.1f} % at 5 mm, {score.points.f_10mm:.1f} % at 10 mm, normals off by "
+            f"{score.normal_deg:.0f} degrees, colour error {score.color:.2f}",
+            soft_wrap=True,
         )
     console.print(f"look at {out / 'contact_sheet.png'} and {out / 'turntable.mp4'}", soft_wrap=True)

@@ -22,7 +22,7 @@ from shards.reader import ColumnTable
 from shards.storage.bounded_cache import BoundedCache
 from shards.storage.frame_pages import FramePages, local_pages
 
-__all__ = ["SampleReader", "choose_views"]
+__all__ = ["SURFACE_COLUMNS", "SampleReader", "choose_views", "surface_target"]
 
 _CORRUPT = (CorruptShardError, ImageError, RowError)
 _ATTEMPTS_PER_MOTION = 4  # other views of the same motion, before another motion takes the place
@@ -32,7 +32,7 @@ _MAX_CLIP_TABLES = 64
 _MAX_OPEN_FILES = 64
 _NUMBER_COLUMNS = tuple(name for name in FRAME_COLUMNS if name not in BLOB_COLUMNS)
 _TARGET_COLUMNS = ("T_objmesh_from_canonical", "occupancy_64")
-_SURFACE_COLUMNS = (
+SURFACE_COLUMNS = (
     "surface_points",
     "surface_normals",
     "surface_colors",
@@ -185,7 +185,7 @@ class SampleReader:
             raise CorruptShardError(
                 "the object of a clip is missing", where=f"{shard.path}/objects.parquet", row=uid
             )
-        columns = _TARGET_COLUMNS + (_SURFACE_COLUMNS if self._config.surface else ())
+        columns = _TARGET_COLUMNS + (SURFACE_COLUMNS if self._config.surface else ())
         table = shard.read_object(uid, columns)
         voxels = table["occupancy_64"][0]
         if len(voxels) and voxels.max() >= OCCUPANCY_VOXELS:
@@ -193,11 +193,12 @@ class SampleReader:
         return _Object(
             T_objmesh_from_canonical=table["T_objmesh_from_canonical"][0],
             voxels=voxels,
-            surface=_surface(table) if self._config.surface else None,
+            surface=surface_target(table) if self._config.surface else None,
         )
 
 
-def _surface(table: ColumnTable) -> SurfaceTarget:
+def surface_target(table: ColumnTable) -> SurfaceTarget:
+    """From the row of an object with `SURFACE_COLUMNS`."""
     return SurfaceTarget(
         points=table["surface_points"][0],
         normals=table["surface_normals"][0],

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from model.data.batch import OCCUPANCY_VOXELS
+from model.data.batch import OCCUPANCY_VOXELS, SurfaceTarget
+from model.evaluation.surface import SurfaceScore
 from model.inference.networks import Networks
 from model.inference.reconstruction import Reconstruction
-from model.inference.scale import KnownScale
 from model.video.frame_choice import FrameChoice
 
 __all__ = ["RECORD", "write_record"]
@@ -29,10 +29,14 @@ def write_record(
     networks: Networks,
     *,
     choice: FrameChoice | None,
-    scale: KnownScale | None,
+    truth: SurfaceTarget | None,
+    score: SurfaceScore | None,
     seconds: Mapping[str, float],
 ) -> None:
-    """`choice`: how the frames were chosen, None when they were named. `seconds` by stage."""
+    """`choice`: how the frames were chosen, None when they were named. `truth` of a clip, and the mesh against it.
+
+    `seconds` by stage.
+    """
     record = {
         "format_version": FORMAT_VERSION,
         "input": _input(result),
@@ -41,7 +45,8 @@ def write_record(
         "checkpoints": [asdict(c) | {"path": str(c.path)} for c in networks.checkpoints],
         "voxels": {"occupied": len(result.voxels), "resolution": OCCUPANCY_VOXELS},
         "surface": _surface(result),
-        "scale": _scale(scale),
+        "scale": _scale(truth),
+        "metrics": _metrics(score),
         "notes": list(result.notes),
         "seconds": {name: round(value, 3) for name, value in seconds.items()},
         "computed_on": {
@@ -106,10 +111,18 @@ def _surface(result: Reconstruction) -> dict[str, Any] | None:
     }
 
 
-def _scale(scale: KnownScale | None) -> dict[str, Any]:
+def _scale(truth: SurfaceTarget | None) -> dict[str, Any]:
     return {
         "unit": "canonical: the object's longest side is 1 where the network is right; metres are not estimated",
         "axes": "object.glb: Y up, voxels.ply: Z up; the object's own axes as its dataset defines them",
-        "metres_per_unit": None if scale is None else scale.metres_per_unit,
-        "metres_from": None if scale is None else scale.origin,
+        "metres_per_unit": None if truth is None else truth.object_scale_m,
+        "metres_from": None if truth is None else "annotation of the dataset, not the images",
     }
+
+
+def _metrics(score: SurfaceScore | None) -> dict[str, Any] | None:
+    """Of the mesh against the true surface of a clip, as model.evaluation.surface defines them; no alignment."""
+    if score is None:
+        return None
+    rounded = asdict(score.points) | {"normal_deg": score.normal_deg, "color": score.color}
+    return {name: round(value, 4) for name, value in rounded.items()}

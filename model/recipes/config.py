@@ -5,8 +5,6 @@ Each section is a dataclass beside the code it configures; `stage_one_config` an
 
 from pathlib import Path
 
-import yaml
-
 from model.recipes.components.hand_encoder_component import HandEncoderComponent
 from model.recipes.components.slat_flow_component import SlatFlowComponent
 from model.recipes.components.slat_vae_component import SlatVaeComponent
@@ -14,8 +12,9 @@ from model.recipes.components.stage_one_component import StageOneComponent
 from model.recipes.components.vae_component import VaeComponent
 from model.recipes.stage_one_config import StageOneTrainingConfig
 from model.recipes.stage_two_config import StageTwoTrainingConfig
-from shards.configuration.layers import MergedSettings, Replacement, read_layers
-from shards.settings import Origins, SettingsError, settings_from_dict
+from shards.configuration.layers import MergedSettings, read_layers
+from shards.configuration.strict_yaml import parse_yaml
+from shards.settings import Origins, settings_from_dict
 
 __all__ = [
     "COMPONENT_NAMES",
@@ -23,7 +22,6 @@ __all__ = [
     "TrainingConfig",
     "load_config",
     "parse_config",
-    "parse_yaml",
     "read_settings",
 ]
 
@@ -57,21 +55,3 @@ def _from_settings(settings: object, *, where: str | Origins) -> TrainingConfig:
 def read_settings(name: str | Path) -> MergedSettings:
     """Content of a preset, `tiny`, or a file, `path/to/own.yaml`, merged with what it extends. SettingsError."""
     return read_layers(name, PRESETS, parse_yaml)
-
-
-class _Loader(yaml.SafeLoader):
-    """Plain content and `!replace`."""
-
-    def replacement(self, node: yaml.Node) -> Replacement:
-        return Replacement(self.construct_mapping(node, deep=True))  # type: ignore[arg-type]  # refuses others itself
-
-
-_Loader.add_constructor("!replace", _Loader.replacement)
-
-
-def parse_yaml(text: str, where: str) -> object:
-    """Content of YAML text; `where` names it in errors. SettingsError."""
-    try:
-        return yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        raise SettingsError(f"{where}: not valid YAML: {' '.join(str(error).split())}") from error

@@ -32,6 +32,7 @@ from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.training.precision import used_precision
+from model.training.sample_threads import SampleThreads
 from model.training.step_generators import sample_generators
 from model.training.trainer import StepReport, TrainingEvent, train
 
@@ -259,13 +260,16 @@ def print_speeds() -> None:
     task = stage_one_task(config)
     batch = random_batch(section.recipe.views[1], section.recipe.image_size, samples)
     precision, _ = used_precision("auto", DEVICE)
-    optimizer = torch.optim.AdamW([p for p in task.module.parameters() if p.requires_grad], lr=1e-4)
+    parameters = [parameter for parameter in task.module.parameters() if parameter.requires_grad]
+    optimizer = torch.optim.AdamW(parameters, lr=1e-4)
+    threads = SampleThreads(DEVICE, torch.get_num_threads())
 
     def step(index: int) -> float:
         start = time.perf_counter()
-        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=precision == "bfloat16"):
-            loss = task.loss(batch, sample_generators(0, index, range(samples))).total
-        loss.backward()
+        generators = sample_generators(0, index, range(samples))
+        threads.backward(
+            task.loss, batch, generators, parameters, bfloat16=precision == "bfloat16", weight=1.0
+        )
         optimizer.step()
         optimizer.zero_grad()
         return samples / (time.perf_counter() - start)

@@ -14,6 +14,7 @@ from model.inference.record import RECORD
 from model.video.frames import ReadLimits
 from model.video.reading import read_frames
 from model.video.staged_folder import MANIFEST
+from shards.reader import open_shards
 from tests.model.inference.small_networks import change_last_bias
 from tests.model.small_run import fails, forehoi
 from tests.model.video.encoded_videos import numbered_video
@@ -75,6 +76,7 @@ def test_everything_is_written(finished, video):
     assert all(len(c["weights_sha256"]) == 64 and c["step"] == c["steps"] == 2 for c in record["checkpoints"])
     assert {"read frames", "load networks", "stage 1: masks and voxels", "mesh"} <= set(record["seconds"])
     assert record["scale"]["metres_per_unit"] is None
+    assert record["metrics"] is None  # nobody knows the truth of a video
     assert record["seed"] == 0
 
 
@@ -125,6 +127,30 @@ def test_a_clip_that_was_held_out_frames_by_number_and_a_box(runs, tmp_path):
     assert {frame["crop"]["origin"] for frame in record["frames"]} <= {"given box", "predicted masks"}
     assert record["scale"]["metres_per_unit"] > 0
     assert "not the images" in record["scale"]["metres_from"]
+
+
+def test_a_clip_is_compared_with_its_true_surface(runs, tmp_path):
+    """The printed metrics once more: from object.glb as others read it, and nearest neighbours by brute force."""
+    out = tmp_path / "out"
+    status, output = forehoi(*command(runs, "--held-out", "--out", out, "--count", 2))
+    assert status == 0, output
+    metrics = record_of(out)["metrics"]
+    assert f"chamfer {metrics['chamfer_cm']:.2f} cm" in output
+
+    shard = open_shards(str(runs.dataset))[0]
+    uid = shard.read_clip(shard.clip_ids[0]).object_uid
+    truth = shard.read_object(uid, ("surface_points", "object_scale_m"))
+    scale = float(truth["object_scale_m"][0])
+    (mesh,) = trimesh.load_scene(out / "object.glb").geometry.values()
+    found_y_up, _ = trimesh.sample.sample_surface(mesh, 30_000, seed=1)
+    found = found_y_up @ [[1, 0, 0], [0, 0, 1], [0, -1, 0]] * scale
+    true = truth["surface_points"][0] * scale
+    distances = np.array([np.linalg.norm(found - point, axis=1).min() for point in true[::8]])
+    back = np.array([np.linalg.norm(true - point, axis=1).min() for point in found[::20]])
+    assert metrics["chamfer_cm"] == pytest.approx(100 * (distances.mean() + back.mean()), rel=0.05)
+    precision, recall = (back <= 0.01).mean(), (distances <= 0.01).mean()
+    harmonic = 200 * precision * recall / max(precision + recall, 1e-9)
+    assert metrics["f_10mm"] == pytest.approx(harmonic, abs=3)
 
 
 def test_no_object_found(runs, video, tmp_path):

@@ -82,8 +82,9 @@ def test_mistakes_name_the_file_and_unknown_presets_the_known(tmp_path):
     path.write_text("extends: small\nstage_one: {beat: 2.0}\n")
     assert f"{path}: unknown key 'stage_one.beat' (did you mean 'beta'?)" in fails("train", path)
     line = fails("train", "tiny_slta")
-    assert "tiny_slta: no such preset (did you mean 'tiny_slat'?)" in line
+    assert "tiny_slta: neither a preset nor a component (did you mean 'tiny_slat'?)" in line
     assert ", ".join(NAMES) in line
+    assert "(did you mean 'stage_one'?)" in fails("train", "stage_on")
 
 
 def test_the_examples_of_the_readme_are_configurations(tmp_path):
