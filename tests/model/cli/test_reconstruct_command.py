@@ -14,7 +14,7 @@ from model.inference.record import RECORD
 from model.video.frames import ReadLimits
 from model.video.reading import read_frames
 from model.video.staged_folder import MANIFEST
-from shards.reader import open_shards
+from shards.reader import find_clip, open_shards
 from tests.model.inference.small_networks import change_last_bias
 from tests.model.small_run import fails, forehoi
 from tests.model.video.encoded_videos import numbered_video
@@ -137,8 +137,9 @@ def test_a_clip_is_compared_with_its_true_surface(runs, tmp_path):
     metrics = record_of(out)["metrics"]
     assert f"chamfer {metrics['chamfer_cm']:.2f} cm" in output
 
-    shard = open_shards(str(runs.dataset))[0]
-    uid = shard.read_clip(shard.clip_ids[0]).object_uid
+    clip_id = record_of(out)["input"]["source"].partition("#")[2]
+    shard = find_clip(open_shards(str(runs.dataset)), clip_id, where=str(runs.dataset))
+    uid = shard.read_clip(clip_id).object_uid
     truth = shard.read_object(uid, ("surface_points", "object_scale_m"))
     scale = float(truth["object_scale_m"][0])
     (mesh,) = trimesh.load_scene(out / "object.glb").geometry.values()
