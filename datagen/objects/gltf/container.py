@@ -2,6 +2,7 @@
 
 import json
 import struct
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from datagen.objects.errors import ObjectError
 from datagen.objects.gltf.resources import SHOWN_CHARS, Resources
 
-__all__ = ["MAX_FILE_MB", "MESHOPT", "GltfFile", "damaged_gltf", "normalised", "open_gltf"]
+__all__ = ["MAX_FILE_MB", "UNPACKING", "GltfFile", "damaged_gltf", "normalised", "open_gltf"]
 
 # A million triangles as text (OBJ), or packed with several 8k images, take less.
 MAX_FILE_MB = 200.0
@@ -19,7 +20,11 @@ DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 UNSIGNED = (5121, 5123, 5125)
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 SMALLEST_GLB = 20  # bytes of the header and of a chunk's
-MESHOPT = ("EXT_meshopt_compression", "KHR_meshopt_compression")
+# Extensions that pack bufferViews, and what unpacks them.
+UNPACKING = {
+    "EXT_meshopt_compression": "npx @gltf-transform/cli copy in.glb out.glb",
+    "KHR_meshopt_compression": "npx gltfpack -i in.glb -o out.glb -noq",
+}
 
 
 def damaged_gltf(path: Path, what: str) -> ObjectError:
@@ -51,13 +56,20 @@ class GltfFile:
         self._resources = Resources(path=path, is_glb=is_glb, max_bytes=self._max_bytes)
         self._images: dict[int, bytes] = {}
         self._buffers = [
-            self._resources.read(entry["uri"], "buffer")
-            if "uri" in entry
-            else glb_chunk
-            if index == 0
-            else None
+            self._stated_buffer(index, entry, glb_chunk)
             for index, entry in enumerate(document.get("buffers", []))
         ]
+
+    def _stated_buffer(self, index: int, entry: dict[str, Any], glb_chunk: bytes | None) -> bytes | None:
+        """The bytes of one buffer; None where it has none, which only matters where they are wanted."""
+        if "uri" not in entry:
+            return glb_chunk if index == 0 else None
+        if not any(entry.get("extensions", {}).get(name, {}).get("fallback") for name in UNPACKING):
+            return self._resources.read(entry["uri"], "buffer")
+        try:  # gltfpack puts the plain copy beside a .glb too, and people leave it behind
+            return replace(self._resources, is_glb=False).read(entry["uri"], "buffer")
+        except ObjectError:
+            return None
 
     def damaged(self, what: str) -> ObjectError:
         """The error for a file that contradicts itself."""
@@ -92,14 +104,14 @@ class GltfFile:
         data = self._buffers[self._whole(view, "buffer")]
         if data is not None:
             return data
-        packing = next((name for name in MESHOPT if name in view.get("extensions", {})), None)
+        packing = next((name for name in UNPACKING if name in view.get("extensions", {})), None)
         if packing is None:
             raise self.damaged("a buffer has neither a uri nor a binary chunk")
         raise ObjectError(
             self.path,
             f"is packed with {packing}, without a plain copy",
             expected="plain or Draco-compressed glTF 2.0",
-            action="Unpack it: `npx @gltf-transform/cli copy in.glb out.glb`.",
+            action=f"Unpack it: `{UNPACKING[packing]}`.",
         )
 
     def accessor(self, index: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.objects.errors import ObjectError
-from datagen.objects.gltf.container import MAX_FILE_MB, MESHOPT, GltfFile, damaged_gltf, open_gltf
+from datagen.objects.gltf.container import MAX_FILE_MB, UNPACKING, GltfFile, damaged_gltf, open_gltf
 from datagen.objects.gltf.draco import DRACO, DracoPrimitive, decoded_primitive
 from datagen.objects.gltf.materials import WEBP, GltfMaterial, UvSource, read_material
 from datagen.objects.gltf.motion import refuse_what_moves
@@ -24,7 +24,7 @@ __all__ = ["read_gltf"]
 # such a texture or buffer has no plain copy; KHR_materials_* change no shape and no base colour.
 IMPLEMENTED = (
     DRACO,
-    *MESHOPT,
+    *UNPACKING,
     WEBP,
     INSTANCING,
     VISIBILITY,

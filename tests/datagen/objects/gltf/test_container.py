@@ -13,6 +13,7 @@ from PIL import Image
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.formats.reading import ReadingConfig, read_object
+from datagen.objects.gltf.container import UNPACKING
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from tests.datagen.objects.gltf_bytes import GltfBytes, glb_of
 
@@ -93,16 +94,16 @@ def test_the_first_version_is_refused_by_its_name(tmp_path, kind):
         read(tmp_path / "a.gltf", OLD[kind])
 
 
-def packed(extension: str, *, plain_copy: bool, with_uri: bool) -> GltfBytes:
-    """As gltfpack writes it: bufferViews of a second buffer that may be empty."""
+def packed(extension: str, *, plain_copy: str | None, with_uri: bool) -> GltfBytes:
+    """As gltfpack writes it: bufferViews of a second buffer, which may lie elsewhere or nowhere."""
     made = square()
     made.json |= {"extensionsUsed": [extension], "extensionsRequired": [extension]}
     for view in made.json["bufferViews"]:
         view["extensions"] = {extension: {"buffer": 0, "byteLength": 4, "byteStride": 4, "count": 1}}
         view["buffer"] = 1
     fallback = {"byteLength": len(made.binary), "extensions": {extension: {"fallback": True}}}
-    if plain_copy:
-        fallback["uri"] = "data:;base64," + base64.b64encode(made.binary).decode()
+    if plain_copy is not None:
+        fallback["uri"] = plain_copy
     first = {"byteLength": 4, **({"uri": "data:;base64,AAAAAA=="} if with_uri else {})}
     made.json["buffers"] = [first, fallback]
     return made
@@ -111,17 +112,19 @@ def packed(extension: str, *, plain_copy: bool, with_uri: bool) -> GltfBytes:
 @pytest.mark.parametrize("suffix", ["glb", "gltf"])
 @pytest.mark.parametrize("extension", ["EXT_meshopt_compression", "KHR_meshopt_compression"])
 def test_packed_buffers_are_read_by_their_plain_copy_or_named(tmp_path, extension, suffix):
-    path = tmp_path / f"a.{suffix}"
-    for plain_copy in (True, False):
+    path, plain = tmp_path / f"a.{suffix}", square().binary
+    inside = "data:;base64," + base64.b64encode(plain).decode()
+    (tmp_path / "a.fallback.bin").write_bytes(plain)
+    for plain_copy in (inside, "a.fallback.bin", None, "left behind.bin"):
         made = packed(extension, plain_copy=plain_copy, with_uri=suffix == "gltf")
         text = json.dumps(made.json).encode()
         data = text if suffix == "gltf" else glb_of(text, b"\0\0\0\0")
-        if plain_copy:
+        if plain_copy in (inside, "a.fallback.bin"):
             assert is_square(read(path, data))
             continue
         with pytest.raises(ObjectError, match=f"is packed with {extension}, without a plain copy") as caught:
             read(path, data)
-        assert "npx @gltf-transform/cli copy in.glb out.glb" in caught.value.action
+        assert caught.value.action == f"Unpack it: `{UNPACKING[extension]}`."
 
 
 def data_uris() -> dict[str, str]:
