@@ -21,10 +21,10 @@ FULL_DETAIL = 0.10  # mean absolute difference of neighbours that counts as 1
 class TextureQuality:
     """Measured on the surface, so unused texture area does not count.
 
-    `texture_resolution_px` is the square root of the texels that lie on the surface (0 without
-    a texture). `color_detail` is 0 for one plain colour and 1 for strong detail everywhere:
-    half from the spread of colours (entropy of a 4x4x4 colour histogram over 4 bit), half from
-    how much colour changes over 2 mm.
+    `texture_resolution_px` is the square root of the texels that lie on the surface, or of the
+    vertices that have a colour where there is no texture (0 without either). `color_detail` is 0
+    for one plain colour and 1 for strong detail everywhere: half from the spread of colours
+    (entropy of a 4x4x4 colour histogram over 4 bit), half from how much colour changes over 2 mm.
     """
 
     texture_resolution_px: int
@@ -32,17 +32,25 @@ class TextureQuality:
 
 
 def _texel_count(mesh: ObjectMesh) -> float:
-    """Texels covered by the surface, summed over materials; overlapping UVs count once at most."""
-    uv = mesh.corner_uv
-    edge_a, edge_b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    uv_area = 0.5 * np.abs(edge_a[:, 0] * edge_b[:, 1] - edge_a[:, 1] * edge_b[:, 0])
-    texels = 0.0
+    """Places with a colour of their own, summed over materials; overlapping UVs count once at most."""
+    count = 0.0
     for index, material in enumerate(mesh.materials):
-        if material.base_color_image is None:
-            continue
-        width, height = Image.open(io.BytesIO(material.base_color_image)).size
-        texels += min(float(uv_area[mesh.face_material == index].sum()), 1.0) * width * height
-    return texels
+        chosen = mesh.face_material == index
+        image, layout = material.base_color_image, material.base_color_layout
+        if image is None and any(material.emissive_rgb):
+            image, layout = material.emissive_image, material.emissive_layout
+        if image is not None:
+            width, height = Image.open(io.BytesIO(image)).size
+            count += min(_uv_area(mesh.uv_of(layout)[chosen]), 1.0) * width * height
+        elif mesh.corner_colors is not None:
+            tinted = (mesh.corner_colors != 1.0).any(axis=(1, 2))
+            count += len(np.unique(mesh.faces[chosen & tinted]))
+    return count
+
+
+def _uv_area(uv: Float[np.ndarray, "face 3 2"]) -> float:
+    edge_a, edge_b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return float((0.5 * np.abs(edge_a[:, 0] * edge_b[:, 1] - edge_a[:, 1] * edge_b[:, 0])).sum())
 
 
 def _histogram_entropy(colors: Float[np.ndarray, "point 3"]) -> float:
