@@ -20,3 +20,4 @@ class FileMesh:
     face_material: Int[np.ndarray, " face"]
     materials: tuple[Material, ...]
     corner_colors: Float[np.ndarray, "face 3 rgb"] | None  # vertex colours, linear 0..1
+    notes: tuple[str, ...] = ()  # what was guessed or left out, one line each
