@@ -11,9 +11,9 @@ from datagen.objects.errors import ObjectError
 from datagen.objects.formats.file_beside import file_beside
 from datagen.objects.formats.plain_material import PLAIN, WHITE
 from datagen.objects.formats.ply_file import PlyElement, PlyHeader, read_body, read_header
-from datagen.objects.formats.polygons import triangulated
 from datagen.objects.mesh.file_mesh import FileMesh
 from datagen.objects.mesh.object_mesh import Material
+from datagen.objects.mesh.polygons import triangulated
 from shards.color import linear_from_srgb
 
 __all__ = ["read_ply"]

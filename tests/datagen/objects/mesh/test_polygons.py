@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from datagen.objects.formats.polygons import triangulated
+from datagen.objects.mesh.polygons import triangulated
 
 SQUARE = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]]
 ARROW = [[0, 0, 0], [2, -1, 0], [0, 2, 0], [-2, -1, 0]]  # a concave quad: its first corner turns back
