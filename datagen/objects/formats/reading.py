@@ -5,23 +5,22 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
-from trimesh.visual import ColorVisuals
 
 from datagen.objects.errors import ObjectError
+from datagen.objects.formats.ply import read_ply
+from datagen.objects.formats.stl import read_stl
+from datagen.objects.formats.units import METRES_PER, Unit, unit_of_size
 from datagen.objects.formats.wavefront import read_obj
 from datagen.objects.gltf.container import MAX_FILE_MB
 from datagen.objects.gltf.scene import read_gltf
 from datagen.objects.gltf.texture_images import permitted_image
 from datagen.objects.mesh.file_mesh import FileMesh, refuse_too_many_faces
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
-from shards.color import linear_from_srgb
 
 __all__ = ["MESH_SUFFIXES", "ReadObject", "ReadingConfig", "object_mesh", "read_object"]
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
-METRES_PER = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 # glTF is Y-up in metres by its specification; the others say nothing.
 GLTF_SUFFIXES = (".glb", ".gltf")
 ROTATION_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -44,23 +43,13 @@ class ReadObject:
 
     mesh: ObjectMesh
     T_obj_from_file: Float[np.ndarray, "4 4"]
-    unit: Literal["m", "cm", "mm"]
+    unit: Unit
     notes: tuple[str, ...] = ()  # a line each on what was guessed or left out
 
 
 def read_object(path: Path, config: ReadingConfig) -> ReadObject:
     """Read GLB, GLTF, OBJ, PLY or STL. ObjectError names what is wrong and what to do."""
-    if not path.is_file():
-        raise ObjectError(path, "does not exist", expected="a mesh file", action="Check the path.")
-    if path.stat().st_size == 0:
-        raise ObjectError(path, "is empty (0 bytes)", expected="a mesh", action="Copy the file again.")
-    if path.stat().st_size > config.max_file_mb * 1e6:
-        raise ObjectError(
-            path,
-            f"has {path.stat().st_size / 1e6:.0f} MB",
-            expected=f"at most {config.max_file_mb:g} MB",
-            action="Make the model smaller or raise `max_file_mb`.",
-        )
+    _refuse_unreadable(path, config)
     suffix = path.suffix.lower()
     if suffix in GLTF_SUFFIXES:
         file_mesh = read_gltf(
@@ -71,10 +60,13 @@ def read_object(path: Path, config: ReadingConfig) -> ReadObject:
             max_faces=config.max_faces,
         )
         return object_mesh(file_mesh, path, config, unit="m", up_axis="y")
+    customary: Unit | None = None
     if suffix == ".obj":
         file_mesh = read_obj(path)
-    elif suffix in (".ply", ".stl"):
-        file_mesh = _read_ply_or_stl(path)
+    elif suffix == ".ply":
+        file_mesh = read_ply(path, path.read_bytes(), max_file_mb=config.max_file_mb)
+    elif suffix == ".stl":
+        file_mesh, customary = read_stl(path, path.read_bytes()), "mm"  # what slicers take
     else:
         raise ObjectError(
             path,
@@ -82,41 +74,33 @@ def read_object(path: Path, config: ReadingConfig) -> ReadObject:
             expected=", ".join(MESH_SUFFIXES),
             action="Convert the mesh, for instance with Blender.",
         )
-    return object_mesh(file_mesh, path, config, unit=config.unit, up_axis=config.up_axis)
+    return object_mesh(
+        file_mesh, path, config, unit=config.unit, customary_unit=customary, up_axis=config.up_axis
+    )
 
 
-def _read_ply_or_stl(path: Path) -> FileMesh:
+def _refuse_unreadable(path: Path, config: ReadingConfig) -> None:
     try:
-        loaded = trimesh.load(path, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
+        if not path.is_file():
+            raise ObjectError(path, "does not exist", expected="a mesh file", action="Check the path.")
+        size = path.stat().st_size
+        path.open("rb").close()
+    except OSError as error:
         raise ObjectError(
             path,
-            f"cannot be parsed ({type(error).__name__}: {error})",
-            expected=f"a valid {path.suffix[1:].upper()} mesh",
-            action="Export the mesh again, for instance with Blender.",
+            f"cannot be read ({error.strerror})",
+            expected="a mesh file that this user may read",
+            action="Check the permissions of the file and its folders.",
         ) from error
-    if not isinstance(loaded, trimesh.Trimesh):
-        loaded = trimesh.Trimesh()  # a point cloud: refused below for having no faces
-    faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-    colors = None
-    # PLY colours are display colours by custom.
-    visual = loaded.visual
-    if isinstance(visual, ColorVisuals) and visual.kind == "face":
-        by_face = np.asarray(visual.face_colors, dtype=np.float64)[:, :3] / 255.0
-        colors = np.repeat(linear_from_srgb(by_face)[:, None], 3, axis=1)
-    elif isinstance(visual, ColorVisuals) and visual.kind == "vertex":
-        by_vertex = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
-        colors = linear_from_srgb(by_vertex)[faces]
-    grey = 0.6 if colors is None else 1.0  # colours multiply it
-    plain = Material(name="plain", base_color_rgba=(grey, grey, grey, 1.0))
-    return FileMesh(
-        verts_file=np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3),
-        faces=faces,
-        corner_uv=np.zeros((len(faces), 3, 2)),
-        face_material=np.zeros(len(faces), dtype=np.int64),
-        materials=(plain,),
-        corner_colors=colors,
-    )
+    if size == 0:
+        raise ObjectError(path, "is empty (0 bytes)", expected="a mesh", action="Copy the file again.")
+    if size > config.max_file_mb * 1e6:
+        raise ObjectError(
+            path,
+            f"has {size / 1e6:.0f} MB",
+            expected=f"at most {config.max_file_mb:g} MB",
+            action="Make the model smaller or raise `max_file_mb`.",
+        )
 
 
 def object_mesh(
@@ -124,16 +108,21 @@ def object_mesh(
     source: Path,
     config: ReadingConfig,
     *,
-    unit: Literal["m", "cm", "mm", "auto"],
+    unit: Unit | Literal["auto"],
     up_axis: Literal["y", "z"],
+    customary_unit: Unit | None = None,
 ) -> ReadObject:
-    """Check a mesh, weld its vertices and place it in the object frame."""
+    """Check a mesh, weld its vertices and place it in the object frame.
+
+    `customary_unit` is what "auto" takes where several units are plausible.
+    """
     _refuse_unusable(file_mesh, source, config)
     verts, faces, kept = _welded(file_mesh.verts_file, file_mesh.faces)
     if len(faces) == 0:
         raise _no_extent(source)
     rotation = ROTATION_FROM_Y_UP if up_axis == "y" else np.eye(3)
-    chosen = unit_of_size(float(np.ptp(verts, axis=0).max())) if unit == "auto" else unit
+    longest = float(np.ptp(verts, axis=0).max())
+    chosen, unit_notes = unit_of_size(longest, customary=customary_unit) if unit == "auto" else (unit, ())
     metres = METRES_PER[chosen]
     verts_metric = verts @ rotation.T * metres
     center = 0.5 * (verts_metric.min(axis=0) + verts_metric.max(axis=0))
@@ -150,18 +139,8 @@ def object_mesh(
         corner_colors=_tint(tint, source),
         more_corner_uv=tuple(uv[kept] for uv in file_mesh.more_corner_uv),
     )
-    return ReadObject(mesh=mesh, T_obj_from_file=T_obj_from_file, unit=chosen, notes=file_mesh.notes)
-
-
-def unit_of_size(longest: float) -> Literal["m", "cm", "mm"]:
-    """The "auto" rule: the unit that makes the longest side 2 cm to 2 m, metres first.
-
-    A hand-held object's longest side read as metres lies in 0.02..2, as centimetres in 2..100
-    and as millimetres above; the limits are 2 and 100.
-    """
-    if longest <= 2.0:
-        return "m"
-    return "cm" if longest <= 100.0 else "mm"
+    notes = (*file_mesh.notes, *unit_notes)
+    return ReadObject(mesh=mesh, T_obj_from_file=T_obj_from_file, unit=chosen, notes=notes)
 
 
 def _welded(

@@ -16,7 +16,7 @@ from datagen.objects.catalogue.licences import UNKNOWN_LICENCE, joined_licences,
 from datagen.objects.errors import ObjectError
 from datagen.objects.formats.reading import MESH_SUFFIXES, ReadingConfig, ReadObject, object_mesh, read_object
 from datagen.objects.gltf.scene import read_gltf
-from datagen.objects.mesh.graspable_size import holdable_scale, scaled_mesh
+from datagen.objects.mesh.graspable_size import holdable_scale, refuse_unheld_size, scaled_mesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.outward_faces import outward_mesh
 from datagen.objects.mesh.texture_quality import TextureQuality, measure_texture_quality
@@ -137,7 +137,7 @@ class MeshFolder:
     def load(self, uid: str) -> ObjectAsset:
         """Read, repair and prepare one mesh; watertight meshes come from the cache the second time."""
         file, note = self._file(uid), self._note(uid)
-        read = read_object(file, self._reading)
+        read = self._read(file)
         mesh = outward_mesh(read.mesh)
         return ObjectAsset(
             uid=uid,
@@ -160,7 +160,13 @@ class MeshFolder:
 
     def texture_quality(self, uid: str) -> TextureQuality:
         """As `load` measures it, without making the watertight mesh."""
-        return measure_texture_quality(outward_mesh(read_object(self._file(uid), self._reading).mesh))
+        return measure_texture_quality(outward_mesh(self._read(self._file(uid)).mesh))
+
+    def _read(self, file: Path) -> ReadObject:
+        """As the file is, which is the size that will be held."""
+        read = read_object(file, self._reading)
+        refuse_unheld_size(read.mesh, file)
+        return read
 
     def _file(self, uid: str) -> Path:
         if uid not in self._files:
