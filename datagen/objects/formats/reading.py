@@ -47,6 +47,7 @@ class ReadObject:
     mesh: ObjectMesh
     T_obj_from_file: Float[np.ndarray, "4 4"]
     unit: Literal["m", "cm", "mm"]
+    notes: tuple[str, ...] = ()  # what was guessed or left out, one line each
 
 
 def read_object(path: Path, config: ReadingConfig) -> ReadObject:
