@@ -143,7 +143,15 @@ def _read_file(file: FoundFile, config: ReadingConfig) -> ReadObject:
             expected="a mesh file that can be read",
             action="Copy or download the file itself, or delete it here.",
         )
-    return read_object(file.path, config)
+    try:
+        return read_object(file.path, config)
+    except OSError as error:
+        raise ObjectError(
+            file.path,
+            f"cannot be read ({error.strerror or error})",
+            expected="a mesh file, and the files that it names",
+            action="Check the disk and the permissions.",
+        ) from error
 
 
 def _grouped(root: Path, meshes: Sequence[FoundFile]) -> dict[str, list[FoundFile]]:

@@ -63,7 +63,7 @@ class _Walk:
         self.hidden: list[str] = []
         self.unreadable: list[str] = []
         self._folders: set[tuple[int, int]] = set()  # device and inode of those that were entered
-        self._linked_to: set[tuple[int, int]] = set()  # of files that were found
+        self._known_files: set[tuple[int, int]] = set()  # of files that were found
         self._root = root
 
     def files(self) -> Iterator[FoundFile]:
@@ -108,13 +108,13 @@ class _Walk:
             yield self._found(link, info)
         elif stat.S_ISDIR(info.st_mode):
             waiting.append(link)
-        elif (info.st_dev, info.st_ino) not in self._linked_to:
+        elif (info.st_dev, info.st_ino) not in self._known_files:
             yield self._found(link, info)
 
     def _found(self, entry: _Entry, info: os.stat_result | str) -> FoundFile:
         if isinstance(info, str):
             return FoundFile(place=entry.place, path=entry.path, size=0, modified_ns=0, fault=info)
-        self._linked_to.add((info.st_dev, info.st_ino))
+        self._known_files.add((info.st_dev, info.st_ino))
         fault = ""
         if not stat.S_ISREG(info.st_mode):
             fault = "is a pipe, a socket or a device, not a file"

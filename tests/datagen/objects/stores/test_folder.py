@@ -241,6 +241,17 @@ def test_what_is_in_the_way_is_said_and_not_read(tmp_path, opened):
             library.measure(uid)
 
 
+def test_a_file_that_goes_while_the_folder_is_open_is_one_line(tmp_path, opened):
+    path = box_at(tmp_path / "meshes" / "mug.stl")
+    library = opened()
+    path.unlink()
+    with pytest.raises(ObjectError, match=r"mug\.stl"):
+        library.measure("folder/mug")
+    path.symlink_to(path)  # going round: an error of the system
+    with pytest.raises(ObjectError, match=r"mug\.stl"):
+        library.measure("folder/mug")
+
+
 def test_the_state_changes_with_any_file(tmp_path):
     box_at(tmp_path / "a" / "mug.stl")
     states = {folder_state(tmp_path)}
