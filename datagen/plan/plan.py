@@ -20,6 +20,7 @@ from shards.storage.whole_file import write_whole
 
 __all__ = [
     "PLAN_FILE",
+    "SELECTION_FILE",
     "Candidate",
     "MotionPlan",
     "Plan",
@@ -31,6 +32,7 @@ __all__ = [
 ]
 
 PLAN_FILE = "plan.parquet"
+SELECTION_FILE = "selection.parquet"  # beside it: every decision that led to it
 PLAN_STREAM = 0x504C414E  # the plan's own stream of the dataset seed
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from datagen.objects.errors import ObjectError
 from datagen.objects.formats.reading import ReadingConfig, ReadObject, read_object
 from datagen.objects.mesh.surface_points import sample_surface
-from datagen.objects.stores.library import REFERENCE_READING, MeshFolder
+from datagen.objects.stores.folder import MeshFolder
+from datagen.objects.stores.library import REFERENCE_READING
 from datagen.objects.watertight.preparation import REFERENCE_PREPARATION
 from tests.cases.outcome import Case
 
@@ -112,7 +113,7 @@ def _refused_by_size(path: Path, reading: ReadingConfig) -> str:
     with TemporaryDirectory() as cache:
         library = MeshFolder(path.parent, reading, REFERENCE_PREPARATION, Path(cache))
         try:
-            library.texture_quality(f"folder/{path.name}")
+            library.measure(f"folder/{path.stem}")
         except ObjectError as error:
             line = str(error)
             if "has a longest side of" in line:

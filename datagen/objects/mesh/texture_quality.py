@@ -8,9 +8,9 @@ from jaxtyping import Float
 from PIL import Image
 
 from datagen.objects.mesh.object_mesh import ObjectMesh
-from datagen.objects.mesh.surface_points import sample_surface
+from datagen.objects.mesh.surface_points import SurfaceSamples, sample_surface
 
-__all__ = ["TextureQuality", "measure_texture_quality"]
+__all__ = ["TextureQuality", "measure_texture_quality", "texture_samples"]
 
 N_POINTS = 4096
 NEIGHBOUR_M = 0.002  # two points this far apart are told apart in a 512 px image of the object
@@ -61,10 +61,14 @@ def _histogram_entropy(colors: Float[np.ndarray, "point 3"]) -> float:
     return float(-(share * np.log2(share)).sum())
 
 
-def measure_texture_quality(mesh: ObjectMesh) -> TextureQuality:
-    """Texture resolution and colour detail of the drawn surface. Deterministic."""
-    rng = np.random.default_rng(0)
-    samples = sample_surface(mesh, N_POINTS, rng, jitter_m=NEIGHBOUR_M)
+def texture_samples(mesh: ObjectMesh) -> SurfaceSamples:
+    """The points that texture quality is measured on. Deterministic."""
+    return sample_surface(mesh, N_POINTS, np.random.default_rng(0), jitter_m=NEIGHBOUR_M)
+
+
+def measure_texture_quality(mesh: ObjectMesh, samples: SurfaceSamples | None = None) -> TextureQuality:
+    """Texture resolution and colour detail of the drawn surface; `samples` are its `texture_samples`."""
+    samples = texture_samples(mesh) if samples is None else samples
     entropy = min(_histogram_entropy(samples.colors) / 4.0, 1.0)
     change = float(np.abs(samples.colors - samples.neighbour_colors).mean())
     detail = 0.5 * entropy + 0.5 * min(change / FULL_DETAIL, 1.0)

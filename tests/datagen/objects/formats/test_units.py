@@ -1,5 +1,7 @@
 """The unit of files that state none, and what is said about it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,7 +10,8 @@ from datagen.objects.errors import ObjectError
 from datagen.objects.formats.reading import ReadingConfig, read_object
 from datagen.objects.formats.units import METRES_PER, unit_of_size
 from datagen.objects.mesh.graspable_size import HELD_LONGEST_M, HOLDABLE_SIDES_M
-from datagen.objects.stores.library import REFERENCE_READING, MeshFolder
+from datagen.objects.stores.folder import MeshFolder
+from datagen.objects.stores.library import REFERENCE_READING
 
 
 @pytest.mark.parametrize(
@@ -91,7 +94,7 @@ def test_absurd_size_is_refused_before_anything_is_made_of_it(tmp_path, quick_pr
         folder / name
     )
     library = MeshFolder(folder, REFERENCE_READING, quick_preparation, tmp_path / "cache")
-    for use in (library.texture_quality, library.load):
+    for use in (library.measure, library.load):
         with pytest.raises(ObjectError, match=r"has a longest side of .* m; expected 0.005 to 1 m"):
-            use(f"folder/{name}")
+            use(f"folder/{Path(name).stem}")
     assert not (tmp_path / "cache").exists()
