@@ -7,6 +7,7 @@ import click
 import torch
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from model.cli.options import plain_errors
 from model.errors import ModelError
@@ -18,7 +19,7 @@ from model.inference.result_files import write_result
 from model.inference.scale import known_scale
 from model.inference.stage_clock import StageClock
 from model.video.frame_choice import FrameChoice
-from model.video.frames import ReadLimits, VideoFrames
+from model.video.frames import ReadLimits, VideoFrames, printable
 from model.video.reading import read_frames, read_informative_frames
 from model.video.square_crop import parsed_box
 from model.video.staged_folder import staged_folder
@@ -200,7 +201,7 @@ def _device(name: str) -> torch.device:
 
 def _print(result: Reconstruction, out: Path, clock: StageClock) -> None:
     """Where to look, how long it took, and what the user should know."""
-    table = Table(title=f"{result.frames.source}", title_justify="left", show_footer=True)
+    table = Table(title=Text(printable(result.frames.source)), title_justify="left", show_footer=True)
     table.add_column("stage", footer="together")
     table.add_column("seconds", justify="right", footer=f"{sum(clock.seconds.values()):.1f}")
     for name, seconds in clock.seconds.items():
@@ -208,7 +209,7 @@ def _print(result: Reconstruction, out: Path, clock: StageClock) -> None:
     console = Console()
     console.print(table)
     for note in result.notes:
-        console.print(f"note: {note}", soft_wrap=True)
+        console.print(f"note: {printable(note)}", soft_wrap=True, markup=False)  # names may hold brackets
     used = ", ".join(str(index) for index in result.frames.indices)
     console.print(f"frames {used}: {len(result.voxels)} voxels", soft_wrap=True)
     if result.surface is not None:
