@@ -105,23 +105,37 @@ def _frames_of_animation(path: Path) -> int:
 
 
 def _read_animation(path: Path, n: int, limits: ReadLimits, indices: Sequence[int] | None) -> VideoFrames:
-    """Frames build on those before them, so all up to the last wanted one are decoded."""
+    """Frames build on those before them, so all up to the last wanted one are decoded, or up to damage."""
     wanted = even_positions(n, limits.max_frames)
     if indices is not None:
         wanted = checked_indices(indices, n, str(path))
-    frames, time_ms = [], 0.0
+    frames: list[VideoFrame] = []
+    time_ms = 0.0
     with _opened(path) as image:
         first = int(getattr(image, "n_frames", 1)) - n
         for index in range(wanted[-1] + 1):
-            image.seek(first + index)
-            image.load()
+            try:
+                image.seek(first + index)
+                image.load()
+            except _DAMAGE:
+                if indices is not None or not frames:
+                    raise
+                break
             if index in wanted:
                 name, time_s = f"frame {index}", time_ms / 1000.0
                 frames.append(_upright_frame(image, image.size, index, time_s, name, [], limits))
             time_ms += image.info.get("duration", 0.0)
     if time_ms == 0.0:  # shown as fast as can be
         frames = [replace(frame, time_s=float("nan")) for frame in frames]
-    return VideoFrames(source=str(path), kind="video", frames=tuple(frames), n_source_frames=n, notes=())
+    missing = len(wanted) - len(frames)
+    note = f"{missing} of {len(wanted)} candidate frames cannot be decoded and are left out"
+    return VideoFrames(
+        source=str(path),
+        kind="video",
+        frames=tuple(frames),
+        n_source_frames=n,
+        notes=(note,) if missing else (),
+    )
 
 
 def _upright_frame(

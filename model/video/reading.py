@@ -88,8 +88,8 @@ def _reader(source: str) -> _Reader:
     address, mark, clip_id = source.rpartition("#")
     if mark and not is_there:
         return partial(read_clip, address, clip_id)
-    known = [file.name for file in path.parent.iterdir()] if path.parent.is_dir() else []
-    close = get_close_matches(path.name, known, n=1)
+    known = {file.name for file in path.parent.iterdir()} if path.parent.is_dir() else set()
+    close = get_close_matches(path.name, sorted(known - {path.name}), n=1)
     raise ModelError(
         source,
         "neither a file nor a folder" if is_there else "no such file or folder",

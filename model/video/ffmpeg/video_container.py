@@ -72,7 +72,7 @@ def film_streams(container: InputContainer, path: Path) -> list[VideoStream]:
         covers = ["a cover image"] if container.streams.video else []
         raise ModelError(
             path,
-            f"it holds {', '.join([*sorted(kinds), *covers])}, but no video",
+            f"it holds {' and '.join([*sorted(kinds), *covers])}, but no video",
             expected="a video",
             action="Choose another file.",
         )
@@ -150,7 +150,7 @@ def _unreadable(path: Path, reason: str) -> ModelError:
     return ModelError(
         path,
         f"not a video that can be read ({reason})",
-        expected="a complete mp4, mov, mkv, webm, avi, ts or gif file",
+        expected="a complete mp4, mov, mkv, webm, avi, ts or gif file, or a JPEG, PNG, WebP, AVIF, BMP or TIFF",
         action="Play it to check it; a download or recording may have been cut off.",
     )
 

@@ -266,6 +266,19 @@ def test_animated_images_are_films(tmp_path: Path, suffix: str) -> None:
     assert frames.notes == ("only the first image of the file used (1 of 2 frames)",)
 
 
+def test_cut_animation_gives_what_is_there(tmp_path: Path) -> None:
+    images = [Image.fromarray(numbered_frame(number)) for number in range(8)]
+    path = tmp_path / "a.png"
+    images[0].save(path, save_all=True, append_images=images[1:], duration=40)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    frames = read_frames(path, ALL)
+    assert 2 <= len(frames) < 8
+    assert numbers(frames) == list(range(len(frames)))
+    assert frames.notes == (f"{8 - len(frames)} of 8 candidate frames cannot be decoded and are left out",)
+    with pytest.raises(ModelError, match=r"a\.png: the image cannot be read: damaged"):
+        read_frames(path, ALL, indices=[0, 7])
+
+
 def test_the_still_of_an_animated_png_is_not_a_frame(tmp_path: Path) -> None:
     """What viewers show that know no animation."""
     images = [Image.fromarray(numbered_frame(number)) for number in (99, 0, 1)]

@@ -361,6 +361,13 @@ def test_missing_file_suggests_its_neighbour(tmp_path: Path) -> None:
     one_line(error, "no such file", "Did you mean", "clip_mug.mp4")
 
 
+def test_a_pipe_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "clip.mp4")
+    with pytest.raises(ModelError) as error:
+        read_frames(tmp_path / "clip.mp4", ALL)
+    one_line(error, "neither a file nor a folder", "Check the path.")
+
+
 @pytest.mark.parametrize("changes", [{"max_frames": 0}, {"max_side_px": 0}])
 def test_limits_are_checked(changes: dict[str, int]) -> None:
     with pytest.raises(ModelError, match="too small"):
