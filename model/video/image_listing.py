@@ -102,9 +102,10 @@ def listed_folder(folder: Path, entries: Sequence[Path]) -> ListedImages:
     shown = [entry for entry in entries if not entry.name.startswith(".") and not entry.is_dir()]
     files = [entry for entry in shown if entry.is_file()]
     suffixes = IMAGE_SUFFIXES + _HEIC_SUFFIXES
-    named = sorted((file for file in files if file.suffix.lower() in suffixes), key=natural_key)
+    named = [file for file in files if file.suffix.lower() in suffixes]
+    named.sort(key=lambda file: (natural_key(file), file.name))  # A.jpg and a.jpg are alike to the first
     heic = [file for file in named if _is_heic(file)]
-    images = tuple(file for file in named if file not in set(heic))
+    images = tuple(file for file in named if file not in heic)
     others = sorted(set(files) - set(named))
     notes = []
     if heic:
