@@ -5,13 +5,19 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.cases import folders, objects_gltf, objects_ply_stl, weights
+from tests.cases import folders, objects_gltf, objects_ply_stl, videos, weights
 from tests.cases.outcome import Case, Outcome, outcome_of
 
 __all__ = ["CASES", "main"]
 
 # One module for each part of the files; a folder that none of them names is reported.
-CASES: tuple[Case, ...] = (*folders.CASES, *objects_gltf.CASES, *objects_ply_stl.CASES, *weights.CASES)
+CASES: tuple[Case, ...] = (
+    *folders.CASES,
+    *objects_gltf.CASES,
+    *objects_ply_stl.CASES,
+    *videos.CASES,
+    *weights.CASES,
+)
 DEFAULT_FOLDER = Path("../shared/cases")
 
 
