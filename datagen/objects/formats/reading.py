@@ -13,11 +13,11 @@ from trimesh.visual import ColorVisuals
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.formats.vertex_colors import baked_vertex_colors
-from datagen.objects.formats.wavefront import read_obj
 from datagen.objects.gltf.container import MAX_FILE_MB
 from datagen.objects.gltf.scene import read_gltf
 from datagen.objects.mesh.file_mesh import FileMesh
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.objects.wavefront.obj_file import read_obj
 from shards.color import linear_from_srgb
 
 __all__ = ["MESH_SUFFIXES", "ReadObject", "ReadingConfig", "object_mesh", "read_object"]
@@ -47,6 +47,7 @@ class ReadObject:
     mesh: ObjectMesh
     T_obj_from_file: Float[np.ndarray, "4 4"]
     unit: Literal["m", "cm", "mm"]
+    notes: tuple[str, ...] = ()  # a line each on what was guessed or left out
 
 
 def read_object(path: Path, config: ReadingConfig) -> ReadObject:
@@ -67,7 +68,7 @@ def read_object(path: Path, config: ReadingConfig) -> ReadObject:
         file_mesh = read_gltf(path, path.read_bytes(), max_file_mb=config.max_file_mb)
         return object_mesh(file_mesh, path, config, unit="m", up_axis="y")
     if suffix == ".obj":
-        file_mesh = read_obj(path)
+        file_mesh = read_obj(path, max_file_mb=config.max_file_mb)
     elif suffix in (".ply", ".stl"):
         file_mesh = _read_ply_or_stl(path)
     else:
@@ -148,7 +149,7 @@ def object_mesh(
         face_material=face_material,
         materials=materials,
     )
-    return ReadObject(mesh=mesh, T_obj_from_file=T_obj_from_file, unit=chosen)
+    return ReadObject(mesh=mesh, T_obj_from_file=T_obj_from_file, unit=chosen, notes=file_mesh.notes)
 
 
 def _with_image(material: Material, image: bytes) -> Material:

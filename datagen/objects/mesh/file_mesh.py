@@ -19,4 +19,6 @@ class FileMesh:
     corner_uv: Float[np.ndarray, "face 3 2"]  # (0, 0) is the lower left of the image
     face_material: Int[np.ndarray, " face"]
     materials: tuple[Material, ...]
-    corner_colors: Float[np.ndarray, "face 3 rgb"] | None  # vertex colours, linear 0..1
+    # Linear factors that multiply base colour and image; None where no face has one, 1 where a face has none.
+    corner_colors: Float[np.ndarray, "face 3 rgb"] | None
+    notes: tuple[str, ...] = ()  # a line each on what was guessed or left out
