@@ -223,7 +223,7 @@ def _polygons(
     place = np.repeat(lines.f, size)
     verts = _indices(lines, written[:, 0], place, lines.v)
     if (written[:, 0] == 0).any():
-        raise lines.error(place[np.argmax(written[:, 0] == 0)], "indices count from 1")
+        raise lines.error(int(place[np.argmax(written[:, 0] == 0)]), "indices count from 1")
     uvs = _indices(lines, written[:, 1], place, lines.vt) if n_uvs else np.full(len(verts), -1)
     return _cleaned(verts, uvs, size, lines.f)
 
@@ -292,7 +292,7 @@ def _indices(
     bad = (written != 0) & ((indices < 0) | (indices >= len(defined)))
     if bad.any():
         first = np.argmax(bad)
-        raise lines.error(place[first], f"index {written[first]} of {len(defined)}")
+        raise lines.error(int(place[first]), f"index {written[first]} of {len(defined)}")
     return indices
 
 

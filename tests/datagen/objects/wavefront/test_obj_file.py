@@ -120,7 +120,7 @@ def test_a_file_of_many_blocks_keeps_order_and_counts(obj):
         back = [2 * k - 2 * count + offset for offset in (0, 2, 3, 1)]
         quads[k] = "f " + " ".join(map(str, back))
     quads[77] += " # a comment"
-    mesh = obj(pairs + "\n".join(quads), max_file_mb=10)
+    mesh = obj(pairs + "\n".join(quads), max_file_mb=10.0)
     assert len(mesh.faces) == 2 * (count - 1)
     np.testing.assert_array_equal(mesh.faces[::2, 0] // 2, np.arange(count - 1))
     np.testing.assert_allclose(area_vector(mesh), [0, 0, count - 1])
@@ -132,7 +132,7 @@ def test_two_triangles_of_one_kind_of_line_do_not_hide_an_uneven_pair(obj):
     assert mesh.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
 
 
-POLYGONS = {  # corners in the plane, area
+POLYGONS: dict[str, tuple[list[tuple[float, float]], float]] = {  # corners in the plane, area
     "square": ([(0, 0), (1, 0), (1, 1), (0, 1)], 1.0),
     "dart": ([(0, 0), (2, -1), (0, 3), (0.5, 0)], 2.25),
     "L": ([(0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2)], 3.0),
@@ -170,7 +170,9 @@ def test_polygons_without_a_plane_end_in_no_traceback(obj):
     assert set(np.unique(mesh.faces)) <= set(range(5))
 
 
-COLORS = {  # what stands behind x y z of four vertices, display colours that it means
+COLORS: dict[
+    str, tuple[list[str], list[tuple[float, float, float]]]
+] = {  # what stands behind x y z of four vertices, display colours that it means
     "floats": (
         ["0.5 0.5 0.5", "1 0 0", "0 1 0", "0 0 1"],
         [(0.5, 0.5, 0.5), (1, 0, 0), (0, 1, 0), (0, 0, 1)],
@@ -218,7 +220,7 @@ def test_polypaint_of_zbrush(obj):
 def test_texture_coordinates_stay_with_their_corners(obj):
     uvs = "vt 0.5\nvt 1 0\nvt 1 1 0\nvt nan nan\n"
     mesh = obj(SQUARE + uvs + "f 1/1 2/2 3/3\nf 1/-1 3/3 4\nf 1/4/7 3/3/7 4/2/7\n")
-    np.testing.assert_array_equal(mesh.corner_uv[0], [[0.5, 0], [1, 0], [1, 1]])
+    np.testing.assert_array_equal(mesh.corner_uv[0], np.array([[0.5, 0], [1, 0], [1, 1]]))
     np.testing.assert_array_equal(mesh.corner_uv[1], np.zeros((3, 2)))  # one corner has none
     np.testing.assert_array_equal(mesh.corner_uv[2], [[0, 0], [1, 1], [1, 0]])
     assert mesh.notes == ("1 texture coordinates are no finite numbers and count as 0",)
