@@ -2,10 +2,18 @@
 
 import re
 
-__all__ = ["joined_lines", "number", "without_comment"]
+__all__ = ["joined_lines", "number", "shown", "without_comment"]
 
 # What the C library of Microsoft prints for NaN and infinity, and what others print for NaN.
 NOT_A_NUMBER = re.compile(r"[-+]?(1\.#(QNAN|SNAN|IND|INF)\d*|nan(\(\w*\))?)", re.IGNORECASE)
+
+
+SHOWN_CHARS = 80
+
+
+def shown(text: str) -> str:
+    """What a file says, quoted and not too long, for messages."""
+    return repr(text if len(text) <= SHOWN_CHARS else f"{text[:SHOWN_CHARS]}...")
 
 
 def joined_lines(text: str) -> list[str]:
@@ -42,5 +50,5 @@ def number(word: str) -> float:
     if NOT_A_NUMBER.fullmatch(word):
         return float("nan")
     if re.fullmatch(r"[-+]?\d+,\d+([eE][-+]?\d+)?", word):
-        raise ValueError(f"{word!r} has a decimal comma: export with decimal points, as in English")
-    raise ValueError(f"{word!r} is not a number")
+        raise ValueError(f"{shown(word)} has a decimal comma: export with decimal points, as in English")
+    raise ValueError(f"{shown(word)} is not a number")

@@ -9,7 +9,7 @@ import numpy as np
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.files.named_files import spellings
-from datagen.objects.wavefront.lines import joined_lines, number, without_comment
+from datagen.objects.wavefront.lines import joined_lines, number, shown, without_comment
 from shards.color import srgb_from_linear
 
 __all__ = ["MtlEntry", "MtlMap", "read_mtl"]
@@ -95,7 +95,7 @@ class _Block:
         return without_comment(self.lines.get(keyword, (0, ""))[1]).split()
 
     def note(self, text: str) -> None:
-        self.notes.append(f"material {self.name!r}: {text}")
+        self.notes.append(f"material {shown(self.name)}: {text}")
 
     def numbers(self, keyword: str, words: list[str]) -> list[float]:
         """The finite numbers of `words`; none, and a note, where one is NaN or infinite."""
@@ -105,13 +105,13 @@ class _Block:
             line_number, rest = self.lines[keyword]
             raise ObjectError(
                 self._path,
-                f"line {line_number} cannot be read: {f'{keyword} {rest}'[:60]!r} ({error})",
+                f"line {line_number} cannot be read: {shown(f'{keyword} {rest}')} ({error})",
                 expected="numbers after Kd, Ks, Ke, Ns, d, Tr, Ni, Pr and Pm",
                 action="Export the materials again, for instance with Blender.",
             ) from error
         if all(map(math.isfinite, values)):
             return values
-        self.note(f"{keyword} {' '.join(words)} is no finite number and is passed over")
+        self.note(f"{keyword} {' '.join(words)[:40]} is no finite number and is passed over")
         return []
 
     def number(self, keyword: str) -> float | None:
@@ -131,7 +131,7 @@ class _Block:
         if kind == "xyz":
             r, g, b = (float(v) for v in srgb_from_linear(SRGB_FROM_XYZ @ np.array([r, g, b])))
         if max(r, g, b) > BYTE_COLORS_ABOVE and keyword != "ke":
-            self.note(f"{keyword} {' '.join(words)} is read as 0..255")
+            self.note(f"{keyword} {' '.join(words[:3])} is read as 0..255")
             r, g, b = r / 255.0, g / 255.0, b / 255.0
         return r, g, b
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from datagen.objects.errors import ObjectError
 from datagen.objects.files.decoded_text import decoded_text
 from datagen.objects.files.named_files import NamedFiles, spellings
+from datagen.objects.wavefront.lines import shown
 from datagen.objects.wavefront.mtl_file import MtlEntry, read_mtl
 
 __all__ = ["FoundEntry", "MtlLibraries"]
@@ -34,8 +35,11 @@ class MtlLibraries:
     def __init__(self, path: Path, files: NamedFiles, lines: tuple[str, ...]) -> None:
         self._path, self._files = path, files
         self._entries: dict[str, FoundEntry] = {}
+        self._spelled_names: dict[str, set[str]] = {}  # names of entries by what else they may mean
+        self._folded_names: dict[str, set[str]] = {}  # the same without regard to case and blanks
         self._read: list[str] = []
         self._missing: list[str] = []
+        self._has_guessed = False
         self.notes: list[str] = []
         for line in dict.fromkeys(lines):
             for name in self._names(line):
@@ -48,20 +52,21 @@ class MtlLibraries:
         where a library is missing or tells of other materials only.
         """
         found = self._known(name)
-        if found is None and not self._read and self._add_namesake():
+        if found is None and not self._read and not self._has_guessed:
+            self._add_namesake()
             found = self._known(name)
         if found is not None or not (self._read or self._missing) or name.lower() in NO_MATERIAL:
             return found
         if self._missing:
             raise ObjectError(
                 self._path,
-                f"material library {self._missing[0]!r} is missing, and with it material {name!r}",
-                expected=f"a file at {self._path.parent / self._missing[0].replace(chr(92), '/')}",
+                f"material library {shown(self._missing[0])} is missing, and with it material {shown(name)}",
+                expected=f"that file in {self._path.parent} or below",
                 action="Put the MTL file there or remove the mtllib line.",
             )
         raise ObjectError(
             self._path,
-            f"material {name!r} is in none of {self._read}",
+            f"material {shown(name)} is in none of {self._read[:5]}",
             expected="every usemtl name in an MTL file",
             action="Add the material to the MTL file or remove the usemtl line.",
         )
@@ -79,10 +84,12 @@ class MtlLibraries:
         found = self._files.find(spellings(name), (self._path.parent,))
         if found is None:
             self._missing.append(name)
-            self.notes.append(f"material library {name!r} is missing")
+            self.notes.append(f"material library {shown(name)} is missing")
             return
         if found.guessed:
-            self.notes.append(f"material library {name!r} is read from {found.path.name!r} beside the OBJ")
+            self.notes.append(
+                f"material library {shown(name)} is read from {found.path.name!r} beside the OBJ"
+            )
         self._add_file(found.path)
 
     def _add_file(self, path: Path) -> None:
@@ -90,36 +97,39 @@ class MtlLibraries:
         entries = read_mtl(path, decoded_text(path, self._files.read(path)))
         for name, entry in entries.items():
             if name in self._entries and self._entries[name].entry != entry:
-                self.notes.append(f"material {name!r} is in two libraries; that of {path.name!r} counts")
+                self.notes.append(f"material {shown(name)} is in two libraries; that of {path.name!r} counts")
             self._entries[name] = FoundEntry(entry=entry, path=path)
+            self._folded_names.setdefault(_folded(name), set()).add(name)
+            for form in spellings(name):
+                self._spelled_names.setdefault(form, set()).add(name)
 
-    def _add_namesake(self) -> bool:
+    def _add_namesake(self) -> None:
+        self._has_guessed = True
         names = (f"{self._path.stem}.mtl", f"{self._path.name}.mtl")
         found = self._files.find(names, (self._path.parent,))
-        if found is None:
-            return False
-        self.notes.append(f"no mtllib line names a file that is there; {found.path.name!r} is read")
-        self._missing.clear()
-        self._add_file(found.path)
-        return True
+        if found is not None:
+            self.notes.append(f"no mtllib line names a file that is there; {found.path.name!r} is read")
+            self._missing.clear()
+            self._add_file(found.path)
 
     def _known(self, name: str) -> FoundEntry | None:
         return self._entries.get(name) or self._spelled(name) or self._folded(name)
 
     def _spelled(self, name: str) -> FoundEntry | None:
-        forms = spellings(name)
-        for form in forms:
+        """The entry of a name that differs by a comment, quotes or %20 on one of the two sides."""
+        for form in spellings(name):
             if form in self._entries:
                 return self._entries[form]
-        fitting = [found for known, found in self._entries.items() if name in spellings(known)]
-        return fitting[0] if len(fitting) == 1 else None
+        return self._only(self._spelled_names.get(name))
 
     def _folded(self, name: str) -> FoundEntry | None:
-        fitting = [found for known, found in self._entries.items() if _folded(known) == _folded(name)]
-        if len(fitting) != 1:
-            return None
-        self.notes.append(f"material {name!r} is taken to be {fitting[0].entry.name!r}")
-        return fitting[0]
+        found = self._only(self._folded_names.get(_folded(name)))
+        if found is not None:
+            self.notes.append(f"material {shown(name)} is taken to be {shown(found.entry.name)}")
+        return found
+
+    def _only(self, names: set[str] | None) -> FoundEntry | None:
+        return self._entries[next(iter(names))] if names is not None and len(names) == 1 else None
 
 
 def _folded(name: str) -> str:

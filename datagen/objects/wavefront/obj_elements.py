@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from datagen.objects.errors import ObjectError
-from datagen.objects.wavefront.lines import joined_lines, number, without_comment
+from datagen.objects.wavefront.lines import joined_lines, number, shown, without_comment
 from datagen.objects.wavefront.obj_vertex_colors import colors_behind_coordinates, polypaint
 
 __all__ = ["ObjElements", "read_elements"]
@@ -74,13 +74,13 @@ class _Lines:
     def error(self, place: int, reason: object) -> ObjectError:
         return ObjectError(
             self._path,
-            f"line {place + 1} cannot be read: {self._lines[place].strip()[:60]!r} ({reason})",
+            f"line {place + 1} cannot be read: {shown(self._lines[place].strip())} ({reason})",
             expected="'v x y z', 'vt u v' or 'f a/b/c ...' with indices that exist",
             action="Export the mesh again, for instance with Blender.",
         )
 
     def beginning(self) -> str:
-        return next((line.strip()[:40] for line in self._lines if line.strip()), "")
+        return next((line.strip() for line in self._lines if line.strip()), "")
 
 
 def read_elements(path: Path, text: str) -> ObjElements:
@@ -101,7 +101,7 @@ def read_elements(path: Path, text: str) -> ObjElements:
     if len(columns) == 0 and len(lines.f) == 0:
         raise ObjectError(
             path,
-            f"has no faces and no vertices (begins with {lines.beginning()!r})",
+            f"has no faces and no vertices (begins with {shown(lines.beginning())})",
             expected="an OBJ file with lines 'v x y z' and 'f a b c'",
             action="Check that the file is what its name says.",
         )
@@ -196,7 +196,7 @@ def _uneven_numbers(
         try:
             words = without_comment(text).split()
             if words[0] != keyword:
-                raise ValueError(f"{words[0]!r} is no keyword")
+                raise ValueError(f"{shown(words[0])} is no keyword")
             if len(words) <= least:
                 raise ValueError(f"fewer than {least} numbers")
             row[: len(words) - 1] = [number(word) for word in words[1 : most + 1]]
@@ -276,7 +276,7 @@ def _corner(word: str) -> tuple[int, int]:
     """a, a/b, a//c or a/b/c: vertex and UV index, 0 for no UV."""
     match = CORNER.fullmatch(word)
     if match is None:
-        raise ValueError(f"{word!r} is no corner")
+        raise ValueError(f"{shown(word)} is no corner")
     return int(match[1]), int(match[2] or 0)
 
 

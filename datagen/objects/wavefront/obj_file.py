@@ -9,12 +9,15 @@ from datagen.objects.files.decoded_text import decoded_text
 from datagen.objects.files.named_files import NamedFiles
 from datagen.objects.mesh.file_mesh import FileMesh
 from datagen.objects.mesh.polygons import triangulated
+from datagen.objects.wavefront.lines import shown
 from datagen.objects.wavefront.mtl_libraries import MtlLibraries
 from datagen.objects.wavefront.obj_elements import ObjElements, read_elements
 from datagen.objects.wavefront.obj_materials import ObjMaterial, ObjMaterials
 from shards.color import linear_from_srgb
 
 __all__ = ["read_obj"]
+
+MAX_NOTES = 20
 
 
 def read_obj(path: Path, *, max_file_mb: float, ignore_missing_images: bool = False) -> FileMesh:
@@ -36,7 +39,7 @@ def read_obj(path: Path, *, max_file_mb: float, ignore_missing_images: bool = Fa
     looks, face_material = _looks(maker, elements.material_names, statement, colored)
     notes = [*elements.notes, *maker.notes]
     if elements.libraries and not elements.material_names:
-        notes.append(f"no usemtl line: material library {elements.libraries[0]!r} is not used")
+        notes.append(f"no usemtl line: material library {shown(elements.libraries[0])} is not used")
     textured = np.array([look.material.base_color_image is not None for look in looks], dtype=bool)
     if colors is not None:
         colors = _factors(colors, looks, textured, face_material, notes)
@@ -51,7 +54,8 @@ def read_obj(path: Path, *, max_file_mb: float, ignore_missing_images: bool = Fa
         face_material=face_material,
         materials=tuple(look.material for look in looks),
         corner_colors=colors,
-        notes=tuple(notes),
+        notes=tuple(notes[:MAX_NOTES])
+        + ((f"and {len(notes) - MAX_NOTES} more notes",) if len(notes) > MAX_NOTES else ()),
     )
 
 
@@ -117,5 +121,5 @@ def _placed_uv(
             placed[own] = placed[own] * look.scale + look.offset
         beyond = ((placed[own] < 0.0) | (placed[own] > 1.0)).any(axis=(1, 2)) if look.clamps else np.zeros(0)
         if beyond.any():
-            notes.append(f"material {look.material.name!r}: -clamp on is not drawn, the image repeats")
+            notes.append(f"material {shown(look.material.name)}: -clamp on is not drawn, the image repeats")
     return placed

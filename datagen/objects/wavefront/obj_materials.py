@@ -11,6 +11,7 @@ from PIL import Image
 from datagen.objects.errors import ObjectError
 from datagen.objects.files.named_files import NamedFiles
 from datagen.objects.mesh.object_mesh import Material
+from datagen.objects.wavefront.lines import shown
 from datagen.objects.wavefront.mtl_file import RGB, MtlEntry, MtlMap
 from datagen.objects.wavefront.mtl_libraries import MtlLibraries
 from datagen.objects.wavefront.mtl_material import PLAIN_KD, material_from_mtl
@@ -52,7 +53,7 @@ class ObjMaterials:
         """A line each, in the order of what they tell of."""
         notes = [*self._libraries.notes, *self._notes]
         if self._unknown:
-            listed = ", ".join(map(repr, self._unknown[:3])) + (" ..." if len(self._unknown) > 3 else "")
+            listed = ", ".join(map(shown, self._unknown[:3])) + (" ..." if len(self._unknown) > 3 else "")
             notes.append(
                 f"no MTL file tells of {len(self._unknown)} materials ({listed}); they are drawn grey"
             )
@@ -82,7 +83,9 @@ class ObjMaterials:
         kd = entry.kd or PLAIN_KD
         whitened = is_colored and kd == PLAIN_KD
         if len({(image.scale, image.offset) for image in placed}) > 1:
-            self._notes.append(f"material {name!r}: all its images are placed as {placed[0].name!r}")
+            self._notes.append(
+                f"material {shown(name)}: all its images are placed as {shown(placed[0].name)}"
+            )
         return ObjMaterial(
             material=material_from_mtl(replace(entry, kd=WHITE) if whitened else entry, images),
             plain_rgb=kd if whitened else WHITE,
@@ -118,14 +121,16 @@ class ObjMaterials:
         found = self._files.find(image.names, folders)
         if found is not None:
             if found.guessed:
-                self._notes.append(f"texture {image.name!r} is read from {found.path.name!r} beside the OBJ")
+                self._notes.append(
+                    f"texture {shown(image.name)} is read from {found.path.name!r} beside the OBJ"
+                )
             return self._read(found.path)
         if self._ignore_missing_images:
-            self._notes.append(f"texture {image.name!r} is missing")
+            self._notes.append(f"texture {shown(image.name)} is missing")
             return None
         raise ObjectError(
             self._path,
-            f"texture {image.name!r} is missing",
+            f"texture {shown(image.name)} is missing",
             expected=f"an image of that name in {self._path.parent} or below (elsewhere nothing is opened)",
             action="Put the image there or remove its map_ line from the MTL file.",
         )

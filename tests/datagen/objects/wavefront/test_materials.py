@@ -2,6 +2,7 @@
 
 import io
 import os
+import time
 import unicodedata
 
 import numpy as np
@@ -10,6 +11,7 @@ from PIL import Image
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.wavefront.mtl_file import read_mtl
+from datagen.objects.wavefront.obj_file import read_obj
 from shards.color import linear_from_srgb
 
 RED = linear_from_srgb(np.array([0.9, 0.05, 0.05]))
@@ -131,6 +133,24 @@ def test_what_is_defined_twice_is_told_of(obj, tetrahedron):
     assert obj(text, **{"b.mtl": "newmtl m\nKd 0 1 0\n"}).notes == ()  # both say the same
 
 
+def test_thousands_of_names_in_another_case_take_no_minutes(obj):
+    count = 3000
+    uses = "".join(f"usemtl m{k}\nf 1 2 3\n" for k in range(count))
+    mtl = "".join(f"newmtl M{k}\nKd 1 0 0\n" for k in range(count))
+    start = time.process_time()
+    mesh = obj("mtllib a.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\n" + uses, **{"a.mtl": mtl})
+    assert time.process_time() - start < 5
+    assert len(mesh.materials) == count
+    assert mesh.notes[0] == "material 'm0' is taken to be 'M0'"
+    assert mesh.notes[-1] == f"and {count - 20} more notes"
+
+
+def test_messages_do_not_repeat_a_whole_file(obj):
+    with pytest.raises(ObjectError, match="is missing") as caught:
+        obj(TEXTURED, **{"a.mtl": f"newmtl m\nmap_Kd {'a #' * 100_000}\n"})
+    assert len(str(caught.value)) < 600
+
+
 TEXTURED = "mtllib a.mtl\nusemtl m\nvt 0 0\nvt 1 0\nvt 0 1\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1 2/2 3/3\n"
 
 TEXTURES = {  # the rest of the map_Kd line, the file it means, whether that is a guess
@@ -209,8 +229,6 @@ def test_links_of_a_download_cache_are_followed(tmp_path, obj):
     """A folder of links whose files lie side by side, under other names."""
     (tmp_path / "blobs").mkdir()
     contents = {"a.obj": TEXTURED.encode(), "a.mtl": b"newmtl m\nmap_Kd wood.png\n", "wood.png": png()}
-    from datagen.objects.wavefront.obj_file import read_obj
-
     (tmp_path / "snapshot").mkdir()
     for index, (name, content) in enumerate(contents.items()):
         (tmp_path / "blobs" / str(index)).write_bytes(content)
