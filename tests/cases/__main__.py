@@ -5,7 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
-from tests.cases import folders, objects_gltf, objects_ply_stl, videos, weights
+from tests.cases import folders, objects_gltf, objects_obj, objects_ply_stl, videos, weights
 from tests.cases.outcome import Case, Outcome, outcome_of
 
 __all__ = ["CASES", "main"]
@@ -14,6 +14,7 @@ __all__ = ["CASES", "main"]
 CASES: tuple[Case, ...] = (
     *folders.CASES,
     *objects_gltf.CASES,
+    *objects_obj.CASES,
     *objects_ply_stl.CASES,
     *videos.CASES,
     *weights.CASES,

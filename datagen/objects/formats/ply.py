@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from datagen.objects.errors import ObjectError
-from datagen.objects.formats.file_beside import file_beside
+from datagen.objects.files.named_files import NamedFiles, spellings
 from datagen.objects.formats.plain_material import PLAIN, WHITE
 from datagen.objects.formats.ply_file import PlyElement, PlyHeader, read_body, read_header
 from datagen.objects.mesh.file_mesh import FileMesh
@@ -246,24 +246,22 @@ def _textured(ply: _Ply, polygons: _Polygons, max_file_mb: float, *, has_colors:
     if placed is None:
         ply.notes.append(f"texture {names[0]!r} is not drawn: there are no texture coordinates")
         return None
+    files = NamedFiles(ply.path, max_file_mb)
     images: list[Path] = []
     for name in names:
-        image = file_beside(ply.path, name)
-        if image is None and has_colors:
+        found = files.find(spellings(name), (ply.path.parent,))
+        if found is None and has_colors:
             ply.notes.append(f"texture {name!r} is missing; drawn with the colours instead")
             return None
-        if image is None:
+        if found is None:
             raise ObjectError(
                 ply.path,
                 f"texture {name!r} is missing",
                 expected=f"an image of that name in {ply.path.parent} or below",
                 action="Put the image there or remove its 'comment TextureFile' from the file.",
             )
-        images.append(image)
-    materials = [
-        replace(WHITE, name=image.name, base_color_image=_image_bytes(ply.path, image, max_file_mb))
-        for image in images
-    ]
+        images.append(found.path)
+    materials = [replace(WHITE, name=image.name, base_color_image=files.read(image)) for image in images]
     number = polygons.element.numbers.get("texnumber", np.zeros(len(polygons.lengths)))
     bare = (number < 0) | (number >= len(materials)) | placed.absent
     material = np.where(bare, len(materials), number).astype(np.int64)
@@ -294,14 +292,3 @@ def _placed(ply: _Ply, polygons: _Polygons) -> _Placed | None:
     if not np.isfinite(placed.uv).all():
         raise ply.refused("a texture coordinate is NaN or infinite", "finite numbers")
     return placed
-
-
-def _image_bytes(path: Path, image: Path, max_file_mb: float) -> bytes:
-    if image.stat().st_size > max_file_mb * 1e6:
-        raise ObjectError(
-            path,
-            f"texture {image.name!r} has {image.stat().st_size / 1e6:.0f} MB",
-            expected=f"at most {max_file_mb:g} MB",
-            action="Make the image smaller or raise `max_file_mb`.",
-        )
-    return image.read_bytes()

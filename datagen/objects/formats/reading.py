@@ -11,12 +11,12 @@ from datagen.objects.errors import ObjectError
 from datagen.objects.formats.ply import read_ply
 from datagen.objects.formats.stl import read_stl
 from datagen.objects.formats.units import METRES_PER, Unit, unit_of_size
-from datagen.objects.formats.wavefront import read_obj
 from datagen.objects.gltf.container import MAX_FILE_MB
 from datagen.objects.gltf.scene import read_gltf
 from datagen.objects.gltf.texture_images import permitted_image
 from datagen.objects.mesh.file_mesh import FileMesh, refuse_too_many_faces
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.objects.wavefront.obj_file import read_obj
 
 __all__ = ["MESH_SUFFIXES", "ReadObject", "ReadingConfig", "object_mesh", "read_object"]
 
@@ -62,7 +62,7 @@ def read_object(path: Path, config: ReadingConfig) -> ReadObject:
         return object_mesh(file_mesh, path, config, unit="m", up_axis="y")
     customary: Unit | None = None
     if suffix == ".obj":
-        file_mesh = read_obj(path)
+        file_mesh = read_obj(path, max_file_mb=config.max_file_mb)
     elif suffix == ".ply":
         file_mesh = read_ply(path, path.read_bytes(), max_file_mb=config.max_file_mb)
     elif suffix == ".stl":

@@ -1,4 +1,4 @@
-"""Polygons of any number of corners to triangles, concave ones too."""
+"""Polygons of any number of corners, concave ones too, to triangles."""
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -6,7 +6,8 @@ from manifold3d import triangulate
 
 __all__ = ["triangulated"]
 
-FLAT = 1e-9  # a corner that turns back by less, relative to the squared area, counts as straight
+# Corners that turn inwards by less than this, relative to the polygon's area, are flat.
+FLAT_TURN = 1e-9
 
 
 def triangulated(
@@ -22,40 +23,58 @@ def triangulated(
     if (lengths == 3).all():
         return np.arange(len(corners)).reshape(-1, 3), np.arange(len(lengths))
     starts = np.cumsum(lengths) - lengths
-    triangles, polygon = [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    triangles, polygons = [np.zeros((0, 3), dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
     for length in np.unique(lengths[lengths >= 3]):
-        rows = np.flatnonzero(lengths == length)
-        first = np.arange(1, length - 1)
-        fan = np.stack([np.zeros_like(first), first, first + 1], axis=1)
-        local = np.broadcast_to(fan, (len(rows), *fan.shape)).copy()
+        chosen = np.flatnonzero(lengths == length)
+        places = starts[chosen][:, None] + np.arange(length)
+        reflex = np.full(len(chosen), -1)
         if length > 3:
-            points = verts[corners[starts[rows, None] + np.arange(length)]]
-            with np.errstate(invalid="ignore", over="ignore"):  # what is not finite is refused later
-                concave = _turns_back(points)
-            for row in np.flatnonzero(concave):
-                local[row] = _ear_cut(points[row], fan)
-        triangles.append((local + starts[rows, None, None]).reshape(-1, 3))
-        polygon.append(np.repeat(rows, length - 2))
-    of_polygon = np.concatenate(polygon)
+            with np.errstate(invalid="ignore", over="ignore"):  # NaN and infinity are refused by others
+                reflex = _reflex_corner(verts[corners[places]])
+        if length == 4:  # a fan from there fills a concave quadrilateral
+            turned = (np.maximum(reflex, 0)[:, None] + np.arange(4)) % 4
+            places, reflex = np.take_along_axis(places, turned, axis=1), np.full(len(chosen), -1)
+        concave = reflex >= 0
+        second = np.arange(1, length - 1)
+        fan = np.stack([np.zeros_like(second), second, second + 1], axis=1)
+        triangles.append(places[~concave][:, fan].reshape(-1, 3))
+        polygons.append(np.repeat(chosen[~concave], length - 2))
+        for row in np.flatnonzero(concave):
+            local = _clipped(verts[corners[places[row]]], fan)
+            triangles.append(places[row][local])
+            polygons.append(np.full(len(local), chosen[row]))
+    of_polygon = np.concatenate(polygons)
     order = np.argsort(of_polygon, kind="stable")
     return np.concatenate(triangles)[order], of_polygon[order]
 
 
-def _turns_back(points: Float[np.ndarray, "polygon corner 3"]) -> np.ndarray:
-    """Whether a polygon has a corner beyond 180 degrees. Not so where a point is NaN."""
-    following = np.roll(points, -1, axis=1)
-    normal = np.cross(points - points[:, :1], following - points[:, :1]).sum(axis=1)  # Newell's
-    turns = np.cross(points - np.roll(points, 1, axis=1), following - points)
-    along = np.einsum("pci,pi->pc", turns, normal)
-    return (along < -FLAT * (normal**2).sum(axis=1, keepdims=True)).any(axis=1)
+def _area_vectors(corners: Float[np.ndarray, "polygon corner 3"]) -> Float[np.ndarray, "polygon 3"]:
+    """Newell's normals, twice the area long: right for concave polygons too."""
+    return np.cross(corners, np.roll(corners, -1, axis=1)).sum(axis=1)
 
 
-def _ear_cut(points: Float[np.ndarray, "corner 3"], fan: Int[np.ndarray, "triangle 3"]) -> np.ndarray:
-    """Triangles of one concave polygon, seen along its normal; the fan where that cannot be cut."""
-    around = points - points[0]
-    normal = np.cross(around, np.roll(around, -1, axis=0)).sum(axis=0)
+def _reflex_corner(corners: Float[np.ndarray, "polygon corner 3"]) -> Int[np.ndarray, " polygon"]:
+    """The corner of each polygon that turns inwards most, -1 where a fan fills it.
+
+    That is so for convex polygons; those without a normal have no better triangulation.
+    """
+    corners = corners - corners[:, :1]
+    normals = _area_vectors(corners)
+    before, after = corners - np.roll(corners, 1, axis=1), np.roll(corners, -1, axis=1) - corners
+    turns = np.einsum("pcx,px->pc", np.cross(before, after), normals)
+    squared = np.einsum("px,px->p", normals, normals)
+    extent = np.ptp(corners, axis=1).max(axis=1)
+    has_normal = squared > 1e-24 * extent**4  # not so for NaN
+    fills = turns.min(axis=1) >= -FLAT_TURN * squared
+    return np.where(has_normal & ~fills, turns.argmin(axis=1), -1)
+
+
+def _clipped(corners: Float[np.ndarray, "corner 3"], fan: Int[np.ndarray, "triangle 3"]) -> np.ndarray:
+    """Triangles of one concave polygon, as indices of its corners; the fan where there are none."""
+    corners = (corners - corners[0]) / np.ptp(corners, axis=0).max()
+    normal = _area_vectors(corners[None])[0]
     axis_u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     axis_u /= np.linalg.norm(axis_u)
     axis_v = np.cross(normal / np.linalg.norm(normal), axis_u)
-    cut = np.asarray(triangulate([np.stack([around @ axis_u, around @ axis_v], axis=1)]), dtype=np.int64)
-    return cut if cut.shape == fan.shape else fan
+    triangles = triangulate([np.stack([corners @ axis_u, corners @ axis_v], axis=1)])
+    return np.asarray(triangles, dtype=np.int64).reshape(-1, 3) if len(triangles) else fan

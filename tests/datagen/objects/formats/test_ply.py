@@ -291,7 +291,7 @@ def test_texture_without_coordinates_is_noted(tmp_path):
 
 def test_huge_texture_is_refused_unread(tmp_path):
     (tmp_path / "tex.png").write_bytes(b"\0" * 1_100_000)
-    with pytest.raises(ObjectError, match=r"texture 'tex.png' has 1 MB; expected at most 1 MB"):
+    with pytest.raises(ObjectError, match=r"tex.png: has 1 MB; expected at most 1 MB"):
         read(tmp_path, ply(textured(), comments=TEXTURED))
 
 

@@ -160,7 +160,10 @@ BAD = {
         lambda folder: [with_image(png())(folder), (folder / "a.png").unlink()][0],
         "texture 'a.png' is missing",
     ),
-    "missing mtl": (write("a.obj", "mtllib b.mtl\n" + QUAD + "f 1 2 3\n"), "library 'b.mtl' is missing"),
+    "missing mtl": (
+        write("a.obj", "mtllib b.mtl\nusemtl x\n" + QUAD + "f 1 2 3\n"),
+        "library 'b.mtl' is missing",
+    ),
     "unknown material": (
         lambda folder: write("a.obj", "mtllib a.mtl\n" + QUAD + "usemtl x\nf 1 2 3\n")(
             write("a.mtl", "newmtl y\n")(folder).parent

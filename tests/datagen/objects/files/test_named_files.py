@@ -1,8 +1,15 @@
 """Files that a mesh names are found where they lie, and nowhere else."""
 
+from pathlib import Path
+
 import pytest
 
-from datagen.objects.formats.file_beside import file_beside
+from datagen.objects.files.named_files import NamedFiles, spellings
+
+
+def file_beside(mesh: Path, written: str) -> Path | None:
+    found = NamedFiles(mesh, 1.0).find(spellings(written), (mesh.parent,))
+    return None if found is None else found.path
 
 
 @pytest.fixture
