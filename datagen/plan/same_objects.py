@@ -1,7 +1,7 @@
 """Objects that are one object: found by their surfaces, whatever the files are called.
 
-The distance of two fingerprints is the largest difference of their numbers. What decides the threshold is
-in DECISIONS.md.
+The distance of two fingerprints is the largest difference of their numbers. What decides the threshold:
+DECISIONS D112.
 """
 
 from collections.abc import Mapping, Sequence
