@@ -103,7 +103,9 @@ def staged_motions(root: Path) -> set[int]:
 
 
 def tree_hashes(root: Path) -> dict[str, str]:
-    files = sorted(path for path in root.rglob("*") if path.is_file())
+    # What was being written has a name of its own, as several processes may begin a dataset at once.
+    litter = set(root.glob(".*.partial"))
+    files = sorted(path for path in root.rglob("*") if path.is_file() and path not in litter)
     return {str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
