@@ -3,7 +3,7 @@
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import trimesh
@@ -19,6 +19,7 @@ from datagen.objects.gltf.scene import read_gltf
 from datagen.objects.mesh.file_mesh import FileMesh
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
 from shards.color import linear_from_srgb
+from shards.settings import Range
 
 __all__ = ["MESH_SUFFIXES", "ReadObject", "ReadingConfig", "object_mesh", "read_object"]
 
@@ -35,9 +36,11 @@ class ReadingConfig:
 
     unit: Literal["m", "cm", "mm", "auto"]  # of OBJ, PLY and STL; glTF is always metres
     up_axis: Literal["y", "z"]  # of OBJ, PLY and STL; glTF is always Y-up
-    max_faces: int  # more are refused
-    max_image_px: int  # longer image sides are refused
-    max_file_mb: float = MAX_FILE_MB  # 10^6 bytes; larger files are refused before they are read
+    max_faces: Annotated[int, Range(1, 1_000_000_000)]  # more are refused
+    max_image_px: Annotated[int, Range(1, 65_536)]  # longer image sides are refused
+    max_file_mb: Annotated[float, Range(0.001, 100_000)] = (
+        MAX_FILE_MB  # 10^6 bytes; larger files are refused before they are read
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
