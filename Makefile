@@ -6,6 +6,7 @@ SHARD  ?= 0
 CONFIG ?= tiny
 OUT    ?= data/$(basename $(notdir $(CONFIG)))
 DATA   ?= data/tiny
+CASES  ?= ../shared/cases
 PYTHON ?= python3.11
 ARGS   ?=
 
@@ -31,12 +32,12 @@ JOBS    ?= 2
 PYTEST  := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -q
 SPREAD  := --numprocesses $(JOBS) --dist loadfile
 
-.PHONY: help setup render train demo test test-slow test-shards test-parity check bench clean
+.PHONY: help setup render train demo test test-slow test-shards test-parity cases check bench clean
 
 help: ## list the targets and their variables
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1\t/' | expand -t 13
 	@echo
-	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) ARGS=$(ARGS) JOBS=$(JOBS) PYTHON=$(PYTHON)"
+	@echo "variables: SHARD=$(SHARD) CONFIG=$(CONFIG) OUT=$(OUT) DATA=$(DATA) CASES=$(CASES) ARGS=$(ARGS) JOBS=$(JOBS) PYTHON=$(PYTHON)"
 	@echo "places of licensed inputs: GRASPXL=$(GRASPXL) OBJAVERSE=$(OBJAVERSE) MANO_DIR=$(MANO_DIR) HTML_DIR=$(HTML_DIR)"
 
 # Blender's module exists for Python 3.11 alone. Debian's python3.11 makes no environments without python3.11-venv.
@@ -109,6 +110,9 @@ test-shards: $(SHARDS)/.installed ## run the tests of shards alone, without Blen
 
 test-parity: $(PARITY) ## run the comparisons with public packages
 	$(PYTEST) -m parity $(ARGS)
+
+cases: $(DEV) ## read the files from the field in CASES, a line each: right, refused or wrong
+	OMP_NUM_THREADS=1 $(VENV)/bin/python -m tests.cases $(CASES)
 
 check: $(DEV) ## lint, types, import contracts, then the tests
 	$(VENV)/bin/ruff check .

@@ -8,3 +8,5 @@ class ModelError(ValueError):
 
     def __init__(self, source: object, problem: str, *, expected: str, action: str) -> None:
         super().__init__(f"{source}: {problem}; expected {expected}. {action}")
+        self.source = str(source)
+        self.problem = problem

@@ -305,7 +305,14 @@ def find_clip(shards: Sequence[Shard], clip_id: str, *, where: str) -> Shard:
 
 
 def _located(url: str | Path) -> tuple[fsspec.AbstractFileSystem, str]:
-    fs, path = fsspec.core.url_to_fs(str(url))
+    try:
+        fs, path = fsspec.core.url_to_fs(str(url))
+    except (ImportError, ValueError) as error:  # the library of a protocol is missing; an unknown protocol
+        raise StorageError(
+            f"cannot be opened: {error}",
+            where=str(url),
+            fix="install what its kind of address needs (http and https: pip install aiohttp), or correct it",
+        ) from error
     return fs, path.rstrip("/")
 
 

@@ -97,7 +97,11 @@ class ObjectRow:
         "float32", "surface", 3, frame="canonical", meaning="Outward unit normals of surface_points."
     )
     surface_colors: UInt8[np.ndarray, "surface 3"] = column(
-        "uint8", "surface", 3, unit="sRGB", meaning="Base colour (RGB, no shading) of surface_points."
+        "uint8",
+        "surface",
+        3,
+        unit="sRGB",
+        meaning="Colour (RGB, no shading) of surface_points: base colour, or emission where that is brighter.",
     )
     sdf_points: Float[np.ndarray, "sample 3"] = column(
         "float32",

@@ -24,8 +24,8 @@ class SettingsError(ValueError):
 class Range:
     """Allowed values of a number, or of each of several, ends included: `Annotated[int, Range(1, 64)]`."""
 
-    low: float
-    high: float
+    low: int | float
+    high: int | float
     rising: bool = False  # of a pair: (lowest, highest) of something
 
     def problem(self, value: object) -> str | None:
@@ -35,11 +35,9 @@ class Range:
         numbers = value if isinstance(value, tuple) else () if value is None else (value,)
         if any(not self.low <= number <= self.high for number in numbers):
             each = "each " if isinstance(value, tuple) else ""
-            return (
-                f"{each}between {self.low:,g} and {self.high:,g}"
-                if self.high < 1e15
-                else f"{each}at least {self.low:g}"
-            )
+            if self.high > 1e15:
+                return f"{each}at least {self.low:,}"
+            return f"{each}between {self.low:,} and {self.high:,}"
         if self.rising and list(numbers) != sorted(numbers):
             return "(lowest, highest)"
         return None

@@ -16,6 +16,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shards.card import write_card
 from shards.columns import table_from_rows
 from shards.errors import (
     IncompleteShardError,
@@ -64,14 +65,16 @@ def motion_dir(dataset_dir: Path, shard: int, motion_index: int) -> Path:
 
 
 def begin_dataset(dataset_dir: Path, record: DatasetRecord) -> None:
-    """Write dataset.json, or check that the one there was made from the same configuration."""
+    """Write dataset.json and README.md, or check that the record there was made from the same configuration."""
     path = dataset_dir / "dataset.json"
-    if not path.exists():
+    if path.exists():
+        present = parse_record(path.read_bytes(), DatasetRecord, where=str(path))
+        fix = "choose another output folder"
+        _check_same_config(present.provenance, record.provenance, where=path, fix=fix)
+    else:
         _make_dir(dataset_dir)
         write_record(path, record)
-        return
-    present = parse_record(path.read_bytes(), DatasetRecord, where=str(path))
-    _check_same_config(present.provenance, record.provenance, where=path, fix="choose another output folder")
+    write_card(dataset_dir, record)
 
 
 def is_shard_committed(dataset_dir: Path, shard: int) -> bool:

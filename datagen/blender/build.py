@@ -48,8 +48,11 @@ class BuiltScene:
 def build_scene(scene: Scene) -> BuiltScene:
     """Empty Blender and fill it with `scene`. Raises TextureError when an image cannot be used."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    held = add_object_mesh(scene.object_mesh, [object_material(m) for m in scene.object_mesh.materials])
-    _mark(held, [PassIndex.OBJECT] * len(scene.object_mesh.materials))
+    drawn = scene.object_mesh
+    held = add_object_mesh(
+        drawn, [object_material(m, tinted=drawn.corner_colors is not None) for m in drawn.materials]
+    )
+    _mark(held, [PassIndex.OBJECT] * len(drawn.materials))
     hand = _add_hand(scene)
     if scene.table is not None:
         _add_table(scene.table)

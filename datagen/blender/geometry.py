@@ -9,8 +9,17 @@ from mathutils import Matrix
 
 from datagen.objects.mesh.object_mesh import ObjectMesh
 
-__all__ = ["add_mesh", "add_object_mesh", "add_vertex_attribute", "set_pose", "set_vertices"]
+__all__ = [
+    "CORNER_COLORS",
+    "add_mesh",
+    "add_object_mesh",
+    "add_vertex_attribute",
+    "set_pose",
+    "set_vertices",
+    "uv_layer_name",
+]
 
+CORNER_COLORS = "corner colours"
 _AUTO_SMOOTH_RAD = np.radians(40.0)
 
 
@@ -33,7 +42,7 @@ def add_mesh(
     _fill(mesh.loops, "vertex_index", faces, np.int32)
     _fill(mesh.polygons, "loop_start", np.arange(0, n_corners, 3), np.int32)
     _fill(mesh.polygons, "material_index", face_material, np.int32)
-    _fill(mesh.uv_layers.new(name="UVMap").uv, "vector", corner_uv, np.float32)
+    _fill(mesh.uv_layers.new(name=uv_layer_name(0)).uv, "vector", corner_uv, np.float32)
     for material in materials:
         mesh.materials.append(material)
     mesh.update(calc_edges=True)
@@ -60,11 +69,24 @@ def add_object_mesh(mesh: ObjectMesh, materials: list[bpy.types.Material]) -> bp
         face_material=mesh.face_material[watertight],
         materials=materials,
     )
+    for layer, uv in enumerate(mesh.more_corner_uv, start=1):
+        more = drawn.data.uv_layers.new(name=uv_layer_name(layer), do_init=False)
+        _fill(more.uv, "vector", uv[watertight], np.float32)
+    if mesh.corner_colors is not None:
+        rgba = np.ones((3 * len(faces[watertight]), 4))
+        rgba[:, :3] = mesh.corner_colors[watertight].reshape(-1, 3)
+        added = drawn.data.attributes.new(CORNER_COLORS, "FLOAT_COLOR", "CORNER")
+        _fill(added.data, "color", rgba, np.float32)
     if mesh.smooth:
         drawn.data.set_sharp_from_angle(angle=_AUTO_SMOOTH_RAD)
     else:
         drawn.data.shade_flat()
     return drawn
+
+
+def uv_layer_name(layer: int) -> str:
+    """Of `ImageLayout.uv_layer`; the first is what image textures use unasked."""
+    return f"UVMap.{layer:03d}" if layer else "UVMap"
 
 
 def set_vertices(drawn: bpy.types.Object, verts: Float[np.ndarray, "vert 3"]) -> None:

@@ -15,7 +15,7 @@ class CountProgress:
     def __init__(self, what: str) -> None:
         console = Console(stderr=True)
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),  # names may have brackets
             BarColumn(),
             MofNCompleteColumn(),
             TimeRemainingColumn(),

@@ -31,9 +31,10 @@ from datagen.inspection.inventory import asset_states
 from datagen.inspection.inventory_table import asset_lines
 from datagen.inspection.replay_table import replay_table
 from datagen.inspection.selection_table import selection_lines, selection_table
-from datagen.jobs.select_motions import SELECTION_FILE, select_motions
+from datagen.jobs.select_motions import select_motions
 from datagen.objects.asset.object_asset import ObjectAsset
 from datagen.objects.errors import ObjectError
+from datagen.plan.plan import SELECTION_FILE
 from datagen.plan.selection_rules import names_of, normalised_name
 from datagen.sampling.streams import Stream, stream_rng
 from datagen.sources.hands import open_hand
@@ -77,8 +78,8 @@ def select(config_name: str, out: Path | None, licence_allow: tuple[str, ...] | 
     console = Console()
     console.print(selection_table(selection.decisions))
     for line in selection_lines(selection):
-        console.print(line)
-    console.print(f"every decision with its reason and metrics: {out / SELECTION_FILE}")
+        click.echo(line)
+    click.echo(f"every decision with its reason and metrics: {out / SELECTION_FILE}")
 
 
 @click.command()

@@ -1,12 +1,17 @@
 """How many motions each rule of the selection removed."""
 
+import re
 from collections.abc import Sequence
 
+from datagen.input_error import printable
 from datagen.inspection.fitting_table import FittingTable, TableColumn
 from datagen.jobs.select_motions import Selection
-from datagen.plan.selection_rules import Decision, removed_by_rule
+from datagen.plan.selection_rules import Decision, Rule, removed_by_rule
 
 __all__ = ["selection_lines", "selection_table"]
+
+_SHOWN = 20  # lines of one sort
+_PARTICULARS = re.compile(r"'[^']*'|\"[^\"]*\"|\S*/\S*|\d[\d.,]*")  # names, paths and numbers in a note
 
 
 def selection_table(decisions: Sequence[Decision]) -> FittingTable:
@@ -31,7 +36,7 @@ def selection_table(decisions: Sequence[Decision]) -> FittingTable:
 
 
 def selection_lines(selection: Selection) -> list[str]:
-    """What was removed, in one line, and what the takedown list names in vain."""
+    """What was removed, in one line; what cannot be used, was joined or guessed; takedown entries in vain."""
     removed = [
         f"{motions:,} {rule.value}"
         for rule, (motions, _) in removed_by_rule(selection.decisions).items()
@@ -43,4 +48,33 @@ def selection_lines(selection: Selection) -> list[str]:
         lines.append(
             f"entries of your takedown list that name nothing here: {', '.join(selection.unmatched)}"
         )
-    return lines
+    lines += _shortened(_unusable(selection), "more that cannot be used")
+    lines += _shortened(list(selection.notes), "more of such lines")
+    return [printable(line) for line in (*lines, *_reading_notes(selection))]
+
+
+def _shortened(lines: Sequence[str], what: str) -> list[str]:
+    more = [f"{len(lines) - _SHOWN:,} {what}"] if len(lines) > _SHOWN else []
+    return [*lines[:_SHOWN], *more]
+
+
+def _unusable(selection: Selection) -> list[str]:
+    """One line an object."""
+    reasons = {d.object_uid: d.reason for d in selection.decisions if d.rule == Rule.UNUSABLE.value}
+    return [f"cannot be used: {uid}: {reason}" for uid, reason in reasons.items()]
+
+
+def _reading_notes(selection: Selection) -> list[str]:
+    """What readers guessed or left out: one line a kind, with the first object that it was said of."""
+    first: dict[str, tuple[str, str]] = {}
+    objects: dict[str, set[str]] = {}
+    for decision in selection.decisions:
+        for note in decision.notes:
+            kind = _PARTICULARS.sub("", note)
+            first.setdefault(kind, (decision.object_uid, note))
+            objects.setdefault(kind, set()).add(decision.object_uid)
+    return [
+        f"note: {uid}: {note}"
+        + (f" (and {len(objects[kind]) - 1:,} like it)" if len(objects[kind]) > 1 else "")
+        for kind, (uid, note) in first.items()
+    ]

@@ -44,7 +44,7 @@ def load_object(config: DatasetConfig, motion: MotionPlan) -> ObjectAsset:
     except ObjectError as error:
         if config.selection.unusable == "stop":
             raise
-        library.texture_quality(uid)
+        library.measure(uid)
         raise UnusableObjectError(str(error)) from error
     if (asset.licence, asset.appearance) != (motion.licence, motion.appearance):
         raise InputError(

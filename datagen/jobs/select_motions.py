@@ -7,10 +7,12 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -18,7 +20,9 @@ import pyarrow.parquet as pq
 from datagen.config import DatasetConfig, placeless
 from datagen.grasps.recorded.graspxl import SequenceFile
 from datagen.input_error import InputError
-from datagen.plan.plan import PLAN_FILE
+from datagen.jobs.neighbour_selections import said_of_neighbours
+from datagen.plan.plan import PLAN_FILE, SELECTION_FILE
+from datagen.plan.same_objects import join_same_objects, said_of_same_objects
 from datagen.plan.selection_rules import (
     Decision,
     decide_object,
@@ -31,11 +35,10 @@ from datagen.sources.motions import recorded_sequences
 from datagen.sources.objects import library_state, open_library
 from shards.storage.whole_file import write_whole
 
-__all__ = ["SELECTION_FILE", "Selection", "select_motions"]
+__all__ = ["Selection", "select_motions"]
 
-SELECTION_FILE = "selection.parquet"
 _PARTIAL = "selection.partial.jsonl"
-_KEY = b"selection_key"
+_KEY, _NOTES = b"selection_key", b"notes"
 _CHUNK = 64  # objects that a process takes at a time
 
 
@@ -45,6 +48,7 @@ class Selection:
 
     decisions: tuple[Decision, ...]
     unmatched: tuple[str, ...]  # entries of the user's takedown list that name nothing here
+    notes: tuple[str, ...]  # what was left out, guessed or joined, one line each
 
     @property
     def kept(self) -> tuple[Decision, ...]:
@@ -75,7 +79,7 @@ def select_motions(
     out.mkdir(parents=True, exist_ok=True)
     with _lock(out / ".selection.lock"):
         takedown = read_takedown(config.selection.takedown)
-        tasks = _tasks(config)
+        tasks, library_notes = _tasks(config)
         known_names = _known_names(tasks)
         _require_known_exclusions(config, known_names)
         unmatched = tuple(sorted(own_entries(config.selection.takedown) - known_names))
@@ -99,8 +103,9 @@ def select_motions(
                 remember(task.uid, of_task)
                 if report is not None:
                     report(len(tasks) - len(waiting) + count + 1, len(tasks))
-            decisions = tuple(decision for task in tasks for decision in done[task.uid])
-        selection = Selection(decisions=decisions, unmatched=unmatched)
+            decisions, same_notes = _joined(config, [d for task in tasks for d in done[task.uid]])
+        notes = (*library_notes, *same_notes, *said_of_neighbours(out, decisions, config.split))
+        selection = Selection(decisions=decisions, unmatched=unmatched, notes=notes)
         _write(selection, path, key)
         (out / _PARTIAL).unlink()
     return selection
@@ -135,16 +140,28 @@ def _require_known_exclusions(config: DatasetConfig, known_names: frozenset[str]
         )
 
 
-def _tasks(config: DatasetConfig) -> list[_Task]:
+def _joined(
+    config: DatasetConfig, decisions: Sequence[Decision]
+) -> tuple[tuple[Decision, ...], tuple[str, ...]]:
+    """What is one object becomes one where the names of objects are ours; published ones stay, and it is said."""
+    if config.objects.source != "folder":
+        return tuple(decisions), said_of_same_objects(decisions, config.split)
+    joined, notes = join_same_objects(decisions)
+    return tuple(joined), notes
+
+
+def _tasks(config: DatasetConfig) -> tuple[list[_Task], tuple[str, ...]]:
+    """All candidates, and what the library says of itself."""
     sequences: Mapping[str, SequenceFile] = recorded_sequences(config.motions)
-    uids = open_library(config.objects, config.motions).uids()
+    library = open_library(config.objects, config.motions)
+    uids, notes = library.uids(), library.notes()
     if config.motions.source == "simulated":
-        return [_Task(uid=uid, sequences=()) for uid in uids]
+        return [_Task(uid=uid, sequences=()) for uid in uids], notes
     of_object: dict[str, list[SequenceFile]] = {}
     for file in sequences.values():
         of_object.setdefault(file.object_uid, []).append(file)
     # An object without a mesh still has its say: it is removed with the reason, not overlooked.
-    return [_Task(uid=uid, sequences=tuple(files)) for uid, files in sorted(of_object.items())]
+    return [_Task(uid=uid, sequences=tuple(files)) for uid, files in sorted(of_object.items())], notes
 
 
 def _key(config: DatasetConfig, takedown: frozenset[str], tasks: Sequence[_Task]) -> str:
@@ -173,9 +190,17 @@ def _decided(
         return
     size = max(_CHUNK, len(tasks) // (16 * workers))  # opening a large store takes seconds
     chunks = [tasks[start : start + size] for start in range(0, len(tasks), size)]
-    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
-        for decided in pool.map(functools.partial(_decide_all, config, takedown), chunks):
-            yield from decided
+    try:
+        with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
+            for decided in pool.map(functools.partial(_decide_all, config, takedown), chunks):
+                yield from decided
+    except (BrokenProcessPool, MemoryError) as error:
+        raise InputError(
+            f"--workers {workers}",
+            "a process that looked at objects was killed, most likely because memory ran out",
+            expected="memory for as many objects at a time",
+            action="Run the same command with fewer workers: what was decided is kept.",
+        ) from error
 
 
 def _decide(
@@ -210,7 +235,7 @@ def _progress_file(
             entry = json.loads(line)
         except ValueError:  # the line at which the earlier run was killed
             continue
-        done[entry["uid"]] = [Decision(**decision) for decision in entry["decisions"]]
+        done[entry["uid"]] = [_decision_of(decision) for decision in entry["decisions"]]
 
     with path.open("a", encoding="utf-8") as file:
         file.write("\n")
@@ -224,12 +249,21 @@ def _progress_file(
         yield done, remember
 
 
+def _decision_of(stored: dict[str, Any]) -> Decision:
+    """From JSON or Parquet, which have lists for tuples."""
+    plain: dict[str, Any] = {
+        name: tuple(value) if isinstance(value, list) else value for name, value in stored.items()
+    }
+    return Decision(**plain)
+
+
 def _write(selection: Selection, path: Path, key: str) -> None:
     columns = {
         field.name: [getattr(decision, field.name) for decision in selection.decisions]
         for field in fields(Decision)
     }
-    table = pa.table(columns).replace_schema_metadata({_KEY: key.encode()})
+    metadata = {_KEY: key.encode(), _NOTES: json.dumps(selection.notes).encode()}
+    table = pa.table(columns).replace_schema_metadata(metadata)
     with write_whole(path, durable=True) as partial:
         pq.write_table(table, partial, compression="zstd", write_page_checksum=True)
 
@@ -240,9 +274,10 @@ def _read(path: Path, key: str, unmatched: tuple[str, ...]) -> Selection | None:
         return None
     try:
         table = pq.read_table(path, page_checksum_verification=True)
-        if (table.schema.metadata or {}).get(_KEY) != key.encode():
+        metadata = table.schema.metadata or {}
+        if metadata.get(_KEY) != key.encode():
             return None
-        decisions = tuple(Decision(**row) for row in table.to_pylist())
-        return Selection(decisions=decisions, unmatched=unmatched)
-    except (pa.ArrowException, OSError, TypeError):
+        decisions = tuple(_decision_of(row) for row in table.to_pylist())
+        return Selection(decisions=decisions, unmatched=unmatched, notes=tuple(json.loads(metadata[_NOTES])))
+    except (pa.ArrowException, OSError, TypeError, KeyError, ValueError):
         return None

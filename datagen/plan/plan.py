@@ -22,6 +22,7 @@ from shards.storage.whole_file import write_whole
 
 __all__ = [
     "PLAN_FILE",
+    "SELECTION_FILE",
     "Candidate",
     "MotionPlan",
     "Plan",
@@ -33,6 +34,7 @@ __all__ = [
 ]
 
 PLAN_FILE = "plan.parquet"
+SELECTION_FILE = "selection.parquet"  # beside it: every decision that led to it
 PLAN_STREAM = 0x504C414E  # the plan's own stream of the dataset seed
 
 

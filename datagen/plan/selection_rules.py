@@ -19,8 +19,10 @@ from datagen.grasps.recorded.graspxl import LICENCE, SequenceFile, read_sequence
 from datagen.input_error import InputError
 from datagen.objects.asset.mirror import unmirrored_uid
 from datagen.objects.catalogue.description import ObjectDescription
+from datagen.objects.catalogue.folder_layouts import drawn_uid
 from datagen.objects.catalogue.licences import spdx_of
 from datagen.objects.errors import ObjectError
+from datagen.objects.mesh.mesh_measures import MeshMeasures
 from datagen.objects.mesh.texture_quality import TextureQuality
 from datagen.objects.stores.library import ObjectLibrary
 from datagen.plan.plan import Candidate
@@ -56,6 +58,7 @@ class Rule(Enum):
     LICENCE = "licence is not allowed"
     ANNOTATION = "annotation: texture, animation, age or size"
     TEXTURE = "texture quality"
+    SAME_OBJECT = "same object as another"
     SEQUENCE = "recorded motion cannot be used"
     MOVEMENT = "degree of object movement"
 
@@ -91,7 +94,7 @@ class MovementRule:
 class SelectionConfig:
     """Thresholds of every rule."""
 
-    # An object that cannot be used: stop and say so (own files), or remove it with the reason (large stores).
+    # An object that cannot be used: remove it and tell the reason, or stop there.
     unusable: Literal["stop", "remove"]
     licence_allow: tuple[str, ...]  # short names (cc0, by, by-nc) or SPDX ids
     takedown: (
@@ -122,6 +125,11 @@ class Decision:
     rise_m: float
     travel_m: float
     rotation_range_rad: float
+    # Of the drawn surface (`Fingerprint`), and what its reader guessed or left out; empty where nothing was read.
+    shape: tuple[float, ...]
+    size_m: float
+    color: tuple[float, ...]
+    notes: tuple[str, ...]
 
     @property
     def candidate(self) -> Candidate:
@@ -171,6 +179,9 @@ def taken_down(uid: str, sequence_id: str, takedown: frozenset[str]) -> str | No
 def names_of(uid: str) -> frozenset[str]:
     """What an object may be called in a list: its uid at this size, itself, or its bare Objaverse id."""
     unmirrored = unmirrored_uid(uid)
+    drawn = drawn_uid(unmirrored)
+    if drawn != unmirrored:  # named for what it is, not for what shares its split
+        return names_of(drawn) | {unmirrored}
     identity = object_identity(unmirrored)
     bare = identity.rpartition("/")[2]
     return frozenset({unmirrored, identity} | ({bare} if _OBJAVERSE_ID.fullmatch(bare) else set()))
@@ -200,7 +211,7 @@ def decide_object(
     `unusable: stop` the ObjectError itself is raised.
     """
     ids = [file.sequence_id for file in sequences] or [""]
-    described = _Described(licence="", appearance="", texture=None)
+    described = _Described(licence="", appearance="", measures=None)
     removed = _by_name(uid, excluded, takedown)
     if removed is None:
         try:
@@ -230,7 +241,7 @@ class _Described:
 
     licence: str
     appearance: str
-    texture: TextureQuality | None
+    measures: MeshMeasures | None
 
 
 def _by_name(uid: str, excluded: frozenset[str], takedown: frozenset[str]) -> Removed:
@@ -243,15 +254,15 @@ def _by_name(uid: str, excluded: frozenset[str], takedown: frozenset[str]) -> Re
 def _by_object(library: ObjectLibrary, uid: str, config: SelectionConfig) -> tuple[Removed, _Described]:
     """Licence and annotation first: they cost nothing; the texture is measured only of what passes."""
     description = library.describe(uid)
-    known = _Described(licence=description.licence, appearance=description.appearance, texture=None)
+    known = _Described(licence=description.licence, appearance=description.appearance, measures=None)
     removed = _by_licence(description.licences, description.licence, config)
     if removed is not None:
         return removed, known
     removed = _by_annotation(description, config.annotation)
     if removed is not None:
         return removed, known
-    texture = library.texture_quality(uid)
-    return _by_texture(texture, config.texture), replace(known, texture=texture)
+    measures = library.measure(uid)
+    return _by_texture(measures.texture, config.texture), replace(known, measures=measures)
 
 
 def _by_licence(licences: Sequence[str], name: str, config: SelectionConfig) -> Removed:
@@ -324,7 +335,9 @@ def _decision(
     described: _Described,
     movement: tuple[float, float, float] = (_NAN, _NAN, _NAN),
 ) -> Decision:
-    texture = described.texture
+    measures = described.measures
+    texture = None if measures is None else measures.texture
+    fingerprint = None if measures is None else measures.fingerprint
     return Decision(
         object_uid=uid,
         sequence_id=sequence_id,
@@ -338,4 +351,8 @@ def _decision(
         rise_m=movement[0],
         travel_m=movement[1],
         rotation_range_rad=movement[2],
+        shape=() if fingerprint is None else fingerprint.shape,
+        size_m=_NAN if fingerprint is None else fingerprint.size_m,
+        color=() if fingerprint is None else fingerprint.color,
+        notes=() if measures is None else measures.notes,
     )

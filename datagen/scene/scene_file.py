@@ -16,7 +16,7 @@ from shards.storage.whole_file import write_whole
 
 __all__ = ["SCENE_FILE_VERSION", "SceneFileError", "load_scene", "save_scene", "scene_sha256"]
 
-SCENE_FILE_VERSION = 2
+SCENE_FILE_VERSION = 3
 
 
 class SceneFileError(ValueError):
@@ -50,7 +50,7 @@ def load_scene(path: Path) -> Scene:
             return scene
     except FileNotFoundError as error:
         raise SceneFileError(f"{path}: no such scene file") from error
-    except (OSError, EOFError, KeyError, TypeError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, TypeError, RuntimeError, zipfile.BadZipFile) as error:
         raise SceneFileError(f"{path}: not a complete scene file ({error}); write it again") from error
     except ValueError as error:
         if isinstance(error, SceneFileError):

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from datagen.objects.errors import ObjectError
 from datagen.objects.formats.reading import ReadingConfig
 from datagen.objects.mesh.registration import RegistrationConfig
+from datagen.objects.stores.folder import MeshFolder, folder_state
 from datagen.objects.stores.graspxl_objects import GraspXLObjects
-from datagen.objects.stores.library import MeshFolder, ObjectLibrary, StarterPack, Sweethome3D
+from datagen.objects.stores.library import ObjectLibrary, StarterPack, Sweethome3D
 from datagen.objects.stores.objaverse import ObjaverseStore, objaverse_root
 from datagen.objects.watertight.preparation import PreparationConfig
 from datagen.sources.motions import MotionsConfig, graspxl_root
@@ -39,7 +41,7 @@ def open_library(config: ObjectsConfig, motions: MotionsConfig) -> ObjectLibrary
     if config.source == "starter":
         return StarterPack()
     if config.source == "folder":
-        return MeshFolder(config.path or Path(), config.reading, config.preparation, cache_dir)
+        return MeshFolder(_folder(config), config.reading, config.preparation, cache_dir)
     if config.source == "sweethome3d":
         return Sweethome3D(config.path, config.preparation, cache_dir)
     if config.source == "objaverse":
@@ -67,8 +69,8 @@ def _graspxl(config: ObjectsConfig, motions: MotionsConfig, cache_dir: Path) -> 
 def library_state(config: ObjectsConfig) -> str:
     """Changes when files that decisions on objects rest on come, go or change on this machine."""
     if config.source == "folder":
-        found = sorted((config.path or Path()).rglob("*"))
-    elif config.source in ("objaverse", "graspxl"):
+        return folder_state(_folder(config))
+    if config.source in ("objaverse", "graspxl"):
         root = objaverse_root(config.objaverse_root)
         found = sorted((root / "metadata").glob("*"))
         found += sorted((root / "glbs").glob("*/*.glb")) if config.textures != "none" else []
@@ -76,6 +78,19 @@ def library_state(config: ObjectsConfig) -> str:
         return ""  # packages: their content does not change by itself
     digest = hashlib.sha256()
     for path in found:
-        known = path.stat()
-        digest.update(f"{path.name} {known.st_size} {known.st_mtime_ns}\n".encode())
+        known = path.stat() if path.exists() else path.lstat()  # a link may lead nowhere
+        digest.update(
+            f"{path.name} {known.st_size} {known.st_mtime_ns}\n".encode("utf-8", "backslashreplace")
+        )
     return digest.hexdigest()
+
+
+def _folder(config: ObjectsConfig) -> Path:
+    if config.path is None:
+        raise ObjectError(
+            "objects.path",
+            "is not set",
+            expected="the folder that holds the meshes",
+            action="Set it beside `source: folder`.",
+        )
+    return config.path.expanduser()

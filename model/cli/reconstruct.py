@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from model.cli.options import plain_errors
 from model.errors import ModelError
@@ -20,7 +21,7 @@ from model.inference.record import write_record
 from model.inference.result_files import write_result
 from model.inference.stage_clock import StageClock
 from model.video.frame_choice import FrameChoice
-from model.video.frames import ReadLimits, VideoFrames
+from model.video.frames import ReadLimits, VideoFrames, printable
 from model.video.reading import read_frames, read_informative_frames
 from model.video.square_crop import parsed_box
 from model.video.staged_folder import staged_folder
@@ -207,7 +208,7 @@ def _device(name: str) -> torch.device:
 
 def _print(result: Reconstruction, score: SurfaceScore | None, out: Path, clock: StageClock) -> None:
     """Where to look, how long it took, how good it is, and what the user should know."""
-    table = Table(title=f"{result.frames.source}", title_justify="left", show_footer=True)
+    table = Table(title=Text(printable(result.frames.source)), title_justify="left", show_footer=True)
     table.add_column("stage", footer="together")
     table.add_column("seconds", justify="right", footer=f"{sum(clock.seconds.values()):.1f}")
     for name, seconds in clock.seconds.items():
@@ -215,7 +216,7 @@ def _print(result: Reconstruction, score: SurfaceScore | None, out: Path, clock:
     console = Console()
     console.print(table)
     for note in result.notes:
-        console.print(f"note: {note}", soft_wrap=True)
+        console.print(f"note: {printable(note)}", soft_wrap=True, markup=False)  # names may hold brackets
     used = ", ".join(str(index) for index in result.frames.indices)
     console.print(f"frames {used}: {len(result.voxels)} voxels", soft_wrap=True)
     if result.surface is not None:

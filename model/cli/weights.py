@@ -5,11 +5,13 @@ from pathlib import Path
 import click
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from model.cli.options import plain_errors
 from model.recipes.config import load_config
 from model.recipes.merging import export_run_adapter, merge_run
-from model.weights.published import ImportReport, import_networks
+from model.weights.importing import ImportReport, import_networks
+from model.weights.published import other_release
 
 __all__ = ["weights"]
 
@@ -44,7 +46,10 @@ def weights() -> None:
 )
 @plain_errors
 def import_weights(source: Path, config_name: str, out: Path) -> None:
-    """Convert published TRELLIS weights of the configuration's stage: SOURCE is a folder of them, or one file.
+    """Convert published TRELLIS weights of the configuration's stage.
+
+    SOURCE is a folder of them, a model in the cache of the Hugging Face hub (models--microsoft--TRELLIS-image-large),
+    the output folder of a training of TRELLIS, or one file (safetensors, also in several parts; .pt).
 
     The file that is written is what `vae.weights` and `stage_one.start.weights`, or `slat_vae.weights` and
     `slat_flow.start`, of a configuration name.
@@ -55,14 +60,16 @@ def import_weights(source: Path, config_name: str, out: Path) -> None:
       forehoi weights import TRELLIS-image-large --config paper_slat --out weights/slat.safetensors
     """
     report = import_networks(source, load_config(config_name).published_networks(), out)
-    console = Console()
-    console.print(_table(report))
+    Console().print(_table(report))
+    for note in report.notes:
+        _say(note)
     for path in report.ignored:
-        console.print(f"not of this stage: {path}", soft_wrap=True)
+        release = other_release(path.name)
+        _say(f"of another release, {release}: {path}" if release else f"not of this stage: {path}")
     for name in report.absent:
-        console.print(f"not in {source}: {name}", soft_wrap=True)
-    console.print(f"every key: {report.key_list}", soft_wrap=True)
-    console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
+        _say(f"not in {source}: {name}")
+    _say(f"every key: {report.key_list}")
+    _say(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
 
 
 @weights.command()
@@ -81,9 +88,8 @@ def merge(run: Path, out: Path) -> None:
       forehoi weights merge runs/paper --out weights/paper.safetensors
     """
     start = merge_run(run, out)
-    console = Console()
-    console.print(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)", soft_wrap=True)
-    console.print(f"to start from it: start: {start}", soft_wrap=True)
+    _say(f"wrote {out} ({out.stat().st_size / 1e6:.1f} MB)")
+    _say(f"to start from it: start: {start}")
 
 
 @weights.command("export-adapter")
@@ -105,7 +111,16 @@ def export(run: Path, out: Path) -> None:
       forehoi weights export-adapter runs/paper --out adapters/paper
     """
     parameters = export_run_adapter(run, out)
-    Console().print(f"wrote {out} ({parameters:,} parameters)", soft_wrap=True)
+    _say(f"wrote {out} ({parameters:,} parameters)")
+
+
+def _say(line: str) -> None:
+    """Names of files may hold anything: brackets that are no markup, bytes that are no UTF-8."""
+    click.echo(_printable(line))
+
+
+def _printable(text: str) -> str:
+    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
 
 
 def _table(report: ImportReport) -> Table:
@@ -116,5 +131,6 @@ def _table(report: ImportReport) -> Table:
     for file in report.imported:
         keys = file.keys
         numbers = (keys.used, keys.missing, keys.unused, keys.mismatched, file.new)
-        table.add_row(file.network, file.path.name, *[str(len(names)) for names in numbers])
+        name = Text(_printable(file.path.name))
+        table.add_row(file.network, name, *[str(len(names)) for names in numbers])
     return table

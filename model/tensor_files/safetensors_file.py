@@ -1,6 +1,6 @@
 """Safetensors files: written whole or not at all; read header first, tensors when they are known to fit."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,11 +10,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from model.errors import ModelError
+from model.tensor_files.file_content import check_file, mistaken_for
 from shards.storage.whole_file import write_whole
 
 __all__ = [
     "Header",
     "KeyComparison",
+    "check_finite",
+    "check_floats",
     "compare_keys",
     "read_header",
     "read_tensors",
@@ -23,6 +26,7 @@ __all__ = [
 ]
 
 _FLOATS = ("F32", "F16", "BF16")
+_NAMED = 3  # keys of each kind that an error names
 
 Shapes = Mapping[str, tuple[int, ...]]
 
@@ -54,10 +58,14 @@ class KeyComparison:
         return not (self.missing or self.unused or self.mismatched)
 
     def problem(self) -> str:
-        """What does not fit, in one line."""
-        lengths = (len(self.missing), len(self.unused), len(self.mismatched))
-        first = next(iter((*self.mismatched, *self.missing, *self.unused)))
-        return "{} keys missing, {} unused, {} of another shape, first ".format(*lengths) + first
+        """What does not fit, in one line: how many keys of each kind, and the first of them by name."""
+        kinds = {"missing": self.missing, "unused": self.unused, "of another shape": self.mismatched}
+        return ", ".join(f"{len(names)} {kind}{_first(names)}" for kind, names in kinds.items())
+
+
+def _first(names: Sequence[str]) -> str:
+    more = " ..." if len(names) > _NAMED else ""
+    return f" ({'; '.join(names[:_NAMED])}{more})" if names else ""
 
 
 def shapes_of(module: nn.Module) -> dict[str, tuple[int, ...]]:
@@ -90,8 +98,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str,
 
 def read_header(path: Path, *, expected: str, action: str) -> Header:
     """Names, shapes and metadata. ModelError when the file is missing, torn, or holds anything but floats."""
-    if not path.is_file():
-        raise ModelError(path, "there is no such file", expected=expected, action=action)
+    check_file(path, expected=expected, action=action)
     try:
         with safe_open(str(path), framework="pt") as file:
             slices = {name: file.get_slice(name) for name in file.keys()}  # noqa: SIM118
@@ -99,24 +106,37 @@ def read_header(path: Path, *, expected: str, action: str) -> Header:
             dtypes = {name: part.get_dtype() for name, part in slices.items()}
             metadata = file.metadata() or {}
     except (OSError, SafetensorError) as error:
-        reason = " ".join(str(error).split())
+        mistaken = mistaken_for(path)
+        reason = " ".join(str(error).split()) if mistaken is None else mistaken.what
+        action = action if mistaken is None else mistaken.action
         raise ModelError(
             path, f"is no complete safetensors file ({reason})", expected=expected, action=action
         ) from error
+    check_floats(path, dtypes)
+    return Header(shapes=shapes, metadata=metadata)
+
+
+def check_floats(path: Path, dtypes: Mapping[str, str]) -> None:
+    """ModelError unless all tensors have a number format that is trained, by the names of safetensors."""
     if odd := [f"{name} as {dtype}" for name, dtype in dtypes.items() if dtype not in _FLOATS]:
         raise ModelError(
             path,
             f"stores {odd[0]} ({len(odd)} such tensors)",
             expected=f"floating-point weights ({', '.join(_FLOATS)})",
-            action="Quantised weights cannot be trained: use the original file.",
+            action="Quantised weights cannot be trained: use the original file, or save wider floats as float32.",
         )
-    return Header(shapes=shapes, metadata=metadata)
 
 
 def read_tensors(path: Path, names: Mapping[str, str]) -> dict[str, Tensor]:
     """Tensors of the file as stored, renamed: `names` gives the new name of each. ModelError when one is not finite."""
     with safe_open(str(path), framework="pt") as file:
         tensors = {new: file.get_tensor(name) for name, new in names.items()}
+    check_finite(path, tensors)
+    return tensors
+
+
+def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """ModelError when a tensor holds NaN or infinity."""
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise ModelError(
@@ -125,4 +145,3 @@ def read_tensors(path: Path, names: Mapping[str, str]) -> dict[str, Tensor]:
                 expected="finite weights",
                 action="The file is damaged: copy it again.",
             )
-    return tensors

@@ -12,15 +12,28 @@ from jaxtyping import Int, UInt8
 from model.errors import ModelError
 
 __all__ = [
+    "DEINTERLACED",
+    "FIRST_ONLY",
+    "NOTED_CHANGES",
+    "TRANSPARENT",
+    "TURNED_BY_EXIF",
     "ReadLimits",
     "VideoFrame",
     "VideoFrames",
     "checked_indices",
     "even_positions",
     "over_black",
+    "printable",
     "scaled_down",
     "scaled_size",
 ]
+
+# Changes of a frame that a user should know, not only the record: NOTED_CHANGES, and turns that differ.
+DEINTERLACED = "deinterlaced"
+FIRST_ONLY = "only the first image of the file used"
+TRANSPARENT = "transparency laid over black"
+TURNED_BY_EXIF = "turned upright as EXIF data say"
+NOTED_CHANGES = (DEINTERLACED, FIRST_ONLY, TRANSPARENT)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +127,12 @@ def checked_indices(indices: Sequence[int], n: int, source: str) -> list[int]:
         expected = f"different indices within 0..{n - 1}"
         raise ModelError(source, problem, expected=expected, action="Change --frames.")
     return sorted(indices)
+
+
+def printable(text: str) -> str:
+    """For terminals and images: what is no character in a file's name, or ends a line, is written as \\x0a is."""
+    shown = "".join(char if char.isprintable() or char == " " else repr(char)[1:-1] for char in text)
+    return shown.encode("utf-8", "backslashreplace").decode()
 
 
 def scaled_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:

@@ -11,7 +11,6 @@ The decoders of gaussians and of radiance fields, slat_dec_gs_swin8_B_64l8gs32 a
 use here.
 """
 
-import json
 from pathlib import Path
 
 import torch
@@ -26,7 +25,9 @@ from model.structured_latent.vae.encoder import SlatEncoder
 from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.tensor_files.safetensors_file import read_header
+from model.weights.json_file import read_json_object
 from model.weights.published import PublishedNetwork, prefixed, published_shapes
+from model.weights.training_run import latent_normalisation
 from model.weights.weight_file import load_weights
 
 __all__ = [
@@ -161,20 +162,27 @@ def _surface_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor
 
 
 def _published_normalisation(path: Path) -> LatentNormalisation:
-    """From the pipeline.json of the folder that the file is in, or its `ckpts`; without one, TRELLIS's."""
+    """Of the training's config.json, or the pipeline.json of the file's folder or the one above; else TRELLIS's."""
+    if (of_run := latent_normalisation(path)) is not None:
+        return _normalisation(path, "the normalization in its training's config.json", of_run)
     # Not resolved: in the cache of the hub, files are links to another folder.
     candidates = [folder / "pipeline.json" for folder in path.absolute().parents[:2]]
     pipeline = next((candidate for candidate in candidates if candidate.is_file()), None)
     if pipeline is None:
         return trellis_normalisation()
+    arguments = read_json_object(pipeline, expected="the pipeline of TRELLIS").get("args")
+    found = arguments.get("slat_normalization") if isinstance(arguments, dict) else None
+    return _normalisation(pipeline, "args.slat_normalization", found)
+
+
+def _normalisation(path: Path, what: str, found: object) -> LatentNormalisation:
     try:
-        found = json.loads(pipeline.read_text("utf-8"))["args"]["slat_normalization"]
-        mean, std = (torch.tensor(found[name], dtype=torch.float32) for name in ("mean", "std"))
+        mean, std = (torch.tensor(found[name], dtype=torch.float32) for name in ("mean", "std"))  # type: ignore[index]
         return LatentNormalisation(mean, std)
     except (ValueError, KeyError, TypeError) as error:
         raise ModelError(
-            pipeline,
-            f"args.slat_normalization cannot be read ({error})",
+            path,
+            f"{what} cannot be read ({error})",
             expected="lists mean and std, one number for each latent channel",
             action="Copy it again, or move it away for TRELLIS-image-large's own values.",
         ) from error

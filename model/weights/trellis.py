@@ -14,6 +14,7 @@ from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.vae import StructureDecoder, StructureEncoder, VaeConfig
 from model.tensor_files.safetensors_file import shapes_of
 from model.weights.published import PublishedNetwork, prefixed, published_shapes
+from model.weights.training_run import latent_normalisation
 from model.weights.weight_file import GEOMETRY, VAE
 
 __all__ = ["stage_one_networks"]
@@ -27,6 +28,7 @@ def stage_one_networks(flow: DualBranchConfig, vae: VaeConfig) -> tuple[Publishe
     geometry = flow.geometry
 
     def flow_tensors(path: Path, tensors: dict[str, Tensor]) -> dict[str, Tensor]:
+        _check_latents(path)
         _check_position_embedding(path, tensors["pos_emb"], flow)
         return prefixed(GEOMETRY, tensors)
 
@@ -69,6 +71,16 @@ def stage_one_networks(flow: DualBranchConfig, vae: VaeConfig) -> tuple[Publishe
             convert=decoder_tensors,
         ),
     )
+
+
+def _check_latents(path: Path) -> None:
+    if latent_normalisation(path) is not None:
+        raise ModelError(
+            path,
+            "was trained on normalised latents, by the config.json of its training",
+            expected="a flow of the latents as the VAE gives them, as TRELLIS-image-large",
+            action="Train it without dataset.args.normalization, or give the published flow.",
+        )
 
 
 def _check_position_embedding(path: Path, published: Tensor, flow: DualBranchConfig) -> None:

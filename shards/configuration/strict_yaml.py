@@ -76,7 +76,7 @@ def _check_size(text: str, where: str) -> None:
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
                 raise _refused(
-                    event, where, f"the alias *{_short(event.anchor)} stands for nothing before it"
+                    event, where, f"the alias *{_short(str(event.anchor))} stands for nothing before it"
                 )
             nodes += sizes[event.anchor]
         elif isinstance(event, yaml.ScalarEvent):
@@ -106,7 +106,8 @@ def _check_size(text: str, where: str) -> None:
 
 
 def _refused(event: yaml.Event, where: str, problem: str) -> SettingsError:
-    return SettingsError(f"{where}, line {event.start_mark.line + 1}: {problem}; expected a configuration")
+    line = "" if event.start_mark is None else f", line {event.start_mark.line + 1}"
+    return SettingsError(f"{where}{line}: {problem}; expected a configuration")
 
 
 def _short(text: str) -> str:

@@ -194,6 +194,14 @@ class ParquetSource:
         with self._storage_errors():
             parts = self.fs.cat_ranges([self.path] * len(ranges), starts, ends, on_error="raise")
         for (start, size), part in zip(ranges, parts):
+            if len(part) > size:  # the whole file, whatever was asked for
+                raise StorageError(
+                    "the server does not answer range requests",
+                    where=self.path,
+                    expected=f"{size} bytes from byte {start}",
+                    found=f"{len(part)} bytes",
+                    fix="download the dataset, or use a server that does",
+                )
             if len(part) != size:
                 found = f"{start + len(part)} bytes or fewer"
                 raise TruncatedError(

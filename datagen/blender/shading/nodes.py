@@ -72,9 +72,10 @@ class Graph:
         """A mesh attribute; `output` is "Vector", "Color" or "Fac"."""
         return self.node("ShaderNodeAttribute", {}, attribute_name=name).outputs[output]
 
-    def image(self, image: bpy.types.Image, **settings: Any) -> bpy.types.Node:
-        """An image texture at the UV coordinates of the mesh."""
-        return self.node("ShaderNodeTexImage", {}, image=image, **settings)
+    def image(self, image: bpy.types.Image, where: Input | None = None, **settings: Any) -> bpy.types.Node:
+        """An image texture at the UV coordinates of the mesh, or at those of `where`."""
+        inputs: dict[str | int, Input] = {} if where is None else {"Vector": where}
+        return self.node("ShaderNodeTexImage", inputs, image=image, **settings)
 
     def bump(self, height_m: Input, strength: float, normal: Input | None = None) -> bpy.types.NodeSocket:
         """Normal of a surface raised by `height_m` metres."""

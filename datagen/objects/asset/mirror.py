@@ -18,7 +18,7 @@ MIRROR_X = np.diag([-1.0, 1.0, 1.0])
 def mirrored_asset(asset: ObjectAsset) -> ObjectAsset:
     """The object under x -> -x in its own frame. Twice mirrored it is itself.
 
-    Corners change order, so faces stay outward, and UVs move with them. `T_obj_from_file` (and the
+    Corners change order, so faces stay outward, and UVs and colours move with them. `T_obj_from_file` (and the
     registration) gets the reflection, so it still leads from the file to this object frame; its
     determinant changes sign.
     """
@@ -61,11 +61,10 @@ def _mirrored_points(points: Float[np.ndarray, "point 3"]) -> Float[np.ndarray, 
 
 
 def _mirrored_mesh(mesh: ObjectMesh) -> ObjectMesh:
-    return replace(
-        mesh,
+    return mesh.with_corners(
+        lambda rows: np.ascontiguousarray(rows[:, ::-1]),
         verts_obj=_mirrored_points(mesh.verts_obj),
         faces=np.ascontiguousarray(mesh.faces[:, ::-1]),
-        corner_uv=np.ascontiguousarray(mesh.corner_uv[:, ::-1]),
     )
 
 

@@ -61,13 +61,14 @@ def licence_of_sketchfab(slug: str | None) -> str:
 
 
 def spdx_of(short: str) -> str:
-    """SPDX id of what a user writes: a short name ("cc0", "by-nc", "cc-by") or an SPDX id, any case.
+    """SPDX id of what a user writes: a short name ("cc0", "by-nc", "cc-by") or an SPDX id, in any case and also
+    with blanks ("CC BY 4.0").
 
     Own licences ("LicenseRef-...") pass as they are. ObjectError with a suggestion for typos.
     """
     word = short.strip()
     spdx_by_word = _spdx_by_word()
-    known = spdx_by_word.get(word.lower())
+    known = spdx_by_word.get("-".join(word.lower().replace("_", " ").split()))
     if known is not None:
         return known
     if word.startswith("LicenseRef-"):

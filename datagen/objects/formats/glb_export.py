@@ -1,20 +1,22 @@
-"""ObjectMesh to GLB: one self-contained file, equal meshes give equal bytes."""
+"""ObjectMesh to GLB: one self-contained, valid file; equal meshes give equal bytes."""
 
 import json
 import struct
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from datagen.objects.formats.reading import ROTATION_FROM_Y_UP
-from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.objects.mesh.object_mesh import ImageLayout, Material, ObjectMesh, Wrap
 from datagen.objects.mesh.surface_points import face_normals
 
 __all__ = ["corner_normals", "mesh_to_glb"]
 
 FLOAT, UINT32, UINT16 = 5126, 5125, 5123
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
+WRAP_CODES: dict[Wrap, int] = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
+PNG_SIGNATURE = b"\x89PNG"
 AUTO_SMOOTH_RAD = np.deg2rad(40.0)
 
 
@@ -34,6 +36,7 @@ class _Writer:
             "bufferViews": [],
         }
         self._image_ids: dict[bytes, int] = {}
+        self._texture_ids: dict[tuple[int, Wrap, Wrap], int] = {}
 
     def view(self, data: bytes, target: int | None = None) -> int:
         self.binary.extend(b"\0" * (-len(self.binary) % 4))
@@ -58,18 +61,31 @@ class _Writer:
         self.json["accessors"].append(entry)
         return len(self.json["accessors"]) - 1
 
-    def texture(self, image: bytes | None) -> dict[str, int] | None:
+    def texture(self, image: bytes | None, layout: ImageLayout) -> dict[str, int] | None:
+        """A textureInfo; glTF's defaults (repeating, TEXCOORD_0) are not written."""
         if image is None:
             return None
         if image not in self._image_ids:
-            kind = "image/png" if image[:4] == b"\x89PNG" else "image/jpeg"
-            if image[8:12] == b"WEBP":
-                kind = "image/webp"
+            kind = "image/png" if image.startswith(PNG_SIGNATURE) else "image/jpeg"
             images = self.json.setdefault("images", [])
             images.append({"bufferView": self.view(image), "mimeType": kind})
-            self.json.setdefault("textures", []).append({"source": len(images) - 1})
             self._image_ids[image] = len(images) - 1
-        return {"index": self._image_ids[image]}
+        key = self._image_ids[image], layout.wrap_u, layout.wrap_v
+        if key not in self._texture_ids:
+            textures, entry = self.json.setdefault("textures", []), {"source": key[0]}
+            if key[1:] != ("repeat", "repeat"):
+                entry["sampler"] = self._sampler(layout)
+            textures.append(entry)
+            self._texture_ids[key] = len(textures) - 1
+        info = {"index": self._texture_ids[key]}
+        return info | ({"texCoord": layout.uv_layer} if layout.uv_layer else {})
+
+    def _sampler(self, layout: ImageLayout) -> int:
+        samplers = self.json.setdefault("samplers", [])
+        entry = {"wrapS": WRAP_CODES[layout.wrap_u], "wrapT": WRAP_CODES[layout.wrap_v]}
+        if entry not in samplers:
+            samplers.append(entry)
+        return samplers.index(entry)
 
     def bytes(self) -> bytes:
         self.binary.extend(b"\0" * (-len(self.binary) % 4))
@@ -91,6 +107,7 @@ class _Writer:
 def mesh_to_glb(mesh: ObjectMesh, *, normals: bool = True) -> bytes:
     """GLB 2.0 in metres, Y-up as the format wants; images are embedded as they are.
 
+    Corner colours become COLOR_0 of the materials that they tint, further UVs TEXCOORD_1 and so on.
     `normals=False` leaves shading normals out (a quarter smaller; viewers then shade flat).
     """
     writer = _Writer()
@@ -100,54 +117,69 @@ def mesh_to_glb(mesh: ObjectMesh, *, normals: bool = True) -> bytes:
         chosen = mesh.face_material == index
         if not chosen.any():
             continue
-        columns = [verts[mesh.faces[chosen]].reshape(-1, 3), mesh.corner_uv[chosen].reshape(-1, 2)]
+        columns = {"POSITION": verts[mesh.faces[chosen]], "TEXCOORD_0": mesh.corner_uv[chosen]}
         if shading is not None:
-            columns.append(shading[chosen].reshape(-1, 3))
-        corners = np.concatenate(columns, axis=1).astype("<f4") + np.float32(0.0)  # no -0.0
-        unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+            columns["NORMAL"] = shading[chosen]
+        for layer in range(1, _n_uv_layers(material)):
+            columns[f"TEXCOORD_{layer}"] = mesh.more_corner_uv[layer - 1][chosen]
+        if mesh.corner_colors is not None and (mesh.corner_colors[chosen] != 1.0).any():
+            columns["COLOR_0"] = mesh.corner_colors[chosen]
         writer.json["meshes"][0]["primitives"].append(
-            _primitive(writer, unique, inverse.reshape(-1), len(writer.json["materials"]))
+            _primitive(writer, columns, len(writer.json["materials"]))
         )
         writer.json["materials"].append(_material_json(writer, material))
     extensions = sorted({name for entry in writer.json["materials"] for name in entry.get("extensions", {})})
-    if any(entry["mimeType"] == "image/webp" for entry in writer.json.get("images", [])):
-        extensions = sorted({*extensions, "EXT_texture_webp"})
     if extensions:
         writer.json["extensionsUsed"] = extensions
     return writer.bytes()
 
 
-def _primitive(
-    writer: _Writer, rows: Float[np.ndarray, "corner column"], index: Int[np.ndarray, " i"], material: int
-) -> dict[str, Any]:
-    uv = rows[:, 3:5].copy()
-    uv[:, 1] = 1.0 - uv[:, 1]
-    attributes = {
-        "POSITION": writer.accessor(rows[:, :3], FLOAT, "VEC3", bounds=True),
-        "TEXCOORD_0": writer.accessor(uv, FLOAT, "VEC2"),
-    }
-    if rows.shape[1] > 5:
-        attributes["NORMAL"] = writer.accessor(rows[:, 5:], FLOAT, "VEC3")
-    small = len(rows) < 65536
-    indices = writer.accessor(index.astype("<u2" if small else "<u4"), UINT16 if small else UINT32, "SCALAR")
+def _n_uv_layers(material: Material) -> int:
+    """Of the images that the material has; TEXCOORD_n must be numbered without gaps."""
+    layouts = (
+        (material.base_color_image, material.base_color_layout),
+        (material.metallic_roughness_image, material.metallic_roughness_layout),
+        (material.normal_image, material.normal_layout),
+        (material.emissive_image, material.emissive_layout),
+    )
+    return 1 + max((layout.uv_layer for image, layout in layouts if image is not None), default=0)
+
+
+def _primitive(writer: _Writer, columns: dict[str, np.ndarray], material: int) -> dict[str, Any]:
+    """Of corner `columns` ("face 3 column"), written in their order; equal corners become one vertex."""
+    widths = [rows.shape[2] for rows in columns.values()]
+    corners = np.concatenate([rows.reshape(-1, rows.shape[2]) for rows in columns.values()], axis=1)
+    corners = corners.astype("<f4") + np.float32(0.0)  # no -0.0
+    unique, inverse = np.unique(corners, axis=0, return_inverse=True)
+    attributes = {}
+    for name, rows in zip(columns, np.split(unique, np.cumsum(widths)[:-1], axis=1)):
+        if name.startswith("TEXCOORD"):
+            rows = np.stack([rows[:, 0], 1.0 - rows[:, 1]], axis=1)  # (0, 0) is the upper left there
+        kind = f"VEC{rows.shape[1]}"
+        attributes[name] = writer.accessor(rows, FLOAT, kind, bounds=name == "POSITION")
+    small = len(unique) < 65536
+    index = inverse.reshape(-1).astype("<u2" if small else "<u4")
+    indices = writer.accessor(index, UINT16 if small else UINT32, "SCALAR")
     return {"attributes": attributes, "indices": indices, "material": material}
 
 
 def _material_json(writer: _Writer, material: Material) -> dict[str, Any]:
     pbr: dict[str, Any] = {
         "baseColorFactor": list(material.base_color_rgba),
-        "baseColorTexture": writer.texture(material.base_color_image),
+        "baseColorTexture": writer.texture(material.base_color_image, material.base_color_layout),
         "metallicFactor": material.metallic,
         "roughnessFactor": material.roughness,
-        "metallicRoughnessTexture": writer.texture(material.metallic_roughness_image),
+        "metallicRoughnessTexture": writer.texture(
+            material.metallic_roughness_image, material.metallic_roughness_layout
+        ),
     }
     strength = max(1.0, *material.emissive_rgb)
     entry: dict[str, Any] = {
         "name": material.name,
         "pbrMetallicRoughness": {key: value for key, value in pbr.items() if value is not None},
-        "normalTexture": writer.texture(material.normal_image),
+        "normalTexture": writer.texture(material.normal_image, material.normal_layout),
         "emissiveFactor": [value / strength for value in material.emissive_rgb],
-        "emissiveTexture": writer.texture(material.emissive_image),
+        "emissiveTexture": writer.texture(material.emissive_image, material.emissive_layout),
         "doubleSided": True,
     }
     extensions: dict[str, Any] = {"KHR_materials_ior": {"ior": material.ior}}

@@ -1,30 +1,27 @@
 """Any mesh file to an ObjectMesh in the object frame: axes, unit, centre, refusals."""
 
-import io
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
-from PIL import Image
-from trimesh.visual import ColorVisuals
 
 from datagen.objects.errors import ObjectError
-from datagen.objects.formats.vertex_colors import baked_vertex_colors
-from datagen.objects.formats.wavefront import read_obj
+from datagen.objects.formats.ply import read_ply
+from datagen.objects.formats.stl import read_stl
+from datagen.objects.formats.units import METRES_PER, Unit, unit_of_size
 from datagen.objects.gltf.container import MAX_FILE_MB
 from datagen.objects.gltf.scene import read_gltf
-from datagen.objects.mesh.file_mesh import FileMesh
+from datagen.objects.gltf.texture_images import permitted_image
+from datagen.objects.mesh.file_mesh import FileMesh, refuse_too_many_faces
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
-from shards.color import linear_from_srgb
+from datagen.objects.wavefront.obj_file import read_obj
 from shards.settings import Range
 
 __all__ = ["MESH_SUFFIXES", "ReadObject", "ReadingConfig", "object_mesh", "read_object"]
 
 MESH_SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
-METRES_PER = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 # glTF is Y-up in metres by its specification; the others say nothing.
 GLTF_SUFFIXES = (".glb", ".gltf")
 ROTATION_FROM_Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -49,30 +46,30 @@ class ReadObject:
 
     mesh: ObjectMesh
     T_obj_from_file: Float[np.ndarray, "4 4"]
-    unit: Literal["m", "cm", "mm"]
+    unit: Unit
+    notes: tuple[str, ...] = ()  # a line each on what was guessed or left out
 
 
 def read_object(path: Path, config: ReadingConfig) -> ReadObject:
     """Read GLB, GLTF, OBJ, PLY or STL. ObjectError names what is wrong and what to do."""
-    if not path.is_file():
-        raise ObjectError(path, "does not exist", expected="a mesh file", action="Check the path.")
-    if path.stat().st_size == 0:
-        raise ObjectError(path, "is empty (0 bytes)", expected="a mesh", action="Copy the file again.")
-    if path.stat().st_size > config.max_file_mb * 1e6:
-        raise ObjectError(
-            path,
-            f"has {path.stat().st_size / 1e6:.0f} MB",
-            expected=f"at most {config.max_file_mb:g} MB",
-            action="Make the model smaller or raise `max_file_mb`.",
-        )
+    _refuse_unreadable(path, config)
     suffix = path.suffix.lower()
     if suffix in GLTF_SUFFIXES:
-        file_mesh = read_gltf(path, path.read_bytes(), max_file_mb=config.max_file_mb)
+        file_mesh = read_gltf(
+            path,
+            path.read_bytes(),
+            max_file_mb=config.max_file_mb,
+            max_image_px=config.max_image_px,
+            max_faces=config.max_faces,
+        )
         return object_mesh(file_mesh, path, config, unit="m", up_axis="y")
+    customary: Unit | None = None
     if suffix == ".obj":
-        file_mesh = read_obj(path)
-    elif suffix in (".ply", ".stl"):
-        file_mesh = _read_ply_or_stl(path)
+        file_mesh = read_obj(path, max_file_mb=config.max_file_mb)
+    elif suffix == ".ply":
+        file_mesh = read_ply(path, path.read_bytes(), max_file_mb=config.max_file_mb)
+    elif suffix == ".stl":
+        file_mesh, customary = read_stl(path, path.read_bytes()), "mm"  # what slicers take
     else:
         raise ObjectError(
             path,
@@ -80,40 +77,33 @@ def read_object(path: Path, config: ReadingConfig) -> ReadObject:
             expected=", ".join(MESH_SUFFIXES),
             action="Convert the mesh, for instance with Blender.",
         )
-    return object_mesh(file_mesh, path, config, unit=config.unit, up_axis=config.up_axis)
+    return object_mesh(
+        file_mesh, path, config, unit=config.unit, customary_unit=customary, up_axis=config.up_axis
+    )
 
 
-def _read_ply_or_stl(path: Path) -> FileMesh:
+def _refuse_unreadable(path: Path, config: ReadingConfig) -> None:
     try:
-        loaded = trimesh.load(path, process=False)
-    except Exception as error:  # trimesh raises whatever its parsers raise
+        if not path.is_file():
+            raise ObjectError(path, "does not exist", expected="a mesh file", action="Check the path.")
+        size = path.stat().st_size
+        path.open("rb").close()
+    except OSError as error:
         raise ObjectError(
             path,
-            f"cannot be parsed ({type(error).__name__}: {error})",
-            expected=f"a valid {path.suffix[1:].upper()} mesh",
-            action="Export the mesh again, for instance with Blender.",
+            f"cannot be read ({error.strerror})",
+            expected="a mesh file that this user may read",
+            action="Check the permissions of the file and its folders.",
         ) from error
-    if not isinstance(loaded, trimesh.Trimesh):
-        loaded = trimesh.Trimesh()  # a point cloud: refused below for having no faces
-    faces = np.asarray(loaded.faces, dtype=np.int64).reshape(-1, 3)
-    colors = None
-    # PLY colours are display colours by custom.
-    visual = loaded.visual
-    if isinstance(visual, ColorVisuals) and visual.kind == "face":
-        by_face = np.asarray(visual.face_colors, dtype=np.float64)[:, :3] / 255.0
-        colors = np.repeat(linear_from_srgb(by_face)[:, None], 3, axis=1)
-    elif isinstance(visual, ColorVisuals) and visual.kind == "vertex":
-        by_vertex = np.asarray(visual.vertex_colors, dtype=np.float64)[:, :3] / 255.0
-        colors = linear_from_srgb(by_vertex)[faces]
-    plain = Material(name="plain", base_color_rgba=(0.6, 0.6, 0.6, 1.0))
-    return FileMesh(
-        verts_file=np.asarray(loaded.vertices, dtype=np.float64).reshape(-1, 3),
-        faces=faces,
-        corner_uv=np.zeros((len(faces), 3, 2)),
-        face_material=np.zeros(len(faces), dtype=np.int64),
-        materials=(plain,),
-        corner_colors=colors,
-    )
+    if size == 0:
+        raise ObjectError(path, "is empty (0 bytes)", expected="a mesh", action="Copy the file again.")
+    if size > config.max_file_mb * 1e6:
+        raise ObjectError(
+            path,
+            f"has {size / 1e6:.0f} MB",
+            expected=f"at most {config.max_file_mb:g} MB",
+            action="Make the model smaller or raise `max_file_mb`.",
+        )
 
 
 def object_mesh(
@@ -121,58 +111,39 @@ def object_mesh(
     source: Path,
     config: ReadingConfig,
     *,
-    unit: Literal["m", "cm", "mm", "auto"],
+    unit: Unit | Literal["auto"],
     up_axis: Literal["y", "z"],
+    customary_unit: Unit | None = None,
 ) -> ReadObject:
-    """Check a mesh, weld its vertices and place it in the object frame."""
+    """Check a mesh, weld its vertices and place it in the object frame.
+
+    `customary_unit` is what "auto" takes where several units are plausible.
+    """
     _refuse_unusable(file_mesh, source, config)
     verts, faces, kept = _welded(file_mesh.verts_file, file_mesh.faces)
     if len(faces) == 0:
         raise _no_extent(source)
     rotation = ROTATION_FROM_Y_UP if up_axis == "y" else np.eye(3)
-    chosen = unit_of_size(float(np.ptp(verts, axis=0).max())) if unit == "auto" else unit
+    longest = float(np.ptp(verts, axis=0).max())
+    chosen, unit_notes = unit_of_size(longest, customary=customary_unit) if unit == "auto" else (unit, ())
     metres = METRES_PER[chosen]
     verts_metric = verts @ rotation.T * metres
     center = 0.5 * (verts_metric.min(axis=0) + verts_metric.max(axis=0))
     T_obj_from_file = np.eye(4)
     T_obj_from_file[:3, :3] = rotation * metres
     T_obj_from_file[:3, 3] = -center
-    corner_uv, materials = file_mesh.corner_uv[kept], file_mesh.materials
-    face_material = file_mesh.face_material[kept]
-    if file_mesh.corner_colors is not None and all(m.base_color_image is None for m in materials):
-        image, corner_uv = baked_vertex_colors(np.clip(file_mesh.corner_colors[kept], 0.0, 1.0))
-        first = materials[0]
-        materials = (_with_image(first, image),)
-        face_material = np.zeros(len(faces), dtype=np.int64)
+    tint = None if file_mesh.corner_colors is None else file_mesh.corner_colors[kept]
     mesh = ObjectMesh(
         verts_obj=verts_metric - center,
         faces=faces,
-        corner_uv=corner_uv,
-        face_material=face_material,
-        materials=materials,
+        corner_uv=file_mesh.corner_uv[kept],
+        face_material=file_mesh.face_material[kept],
+        materials=_permitted_materials(file_mesh.materials, source, config.max_image_px),
+        corner_colors=_tint(tint, source),
+        more_corner_uv=tuple(uv[kept] for uv in file_mesh.more_corner_uv),
     )
-    return ReadObject(mesh=mesh, T_obj_from_file=T_obj_from_file, unit=chosen)
-
-
-def _with_image(material: Material, image: bytes) -> Material:
-    return Material(
-        name="vertex_colors",
-        base_color_rgba=(1.0, 1.0, 1.0, 1.0),
-        base_color_image=image,
-        metallic=0.0,
-        roughness=max(material.roughness, 0.4),
-    )
-
-
-def unit_of_size(longest: float) -> Literal["m", "cm", "mm"]:
-    """The "auto" rule: the unit that makes the longest side 2 cm to 2 m, metres first.
-
-    A hand-held object's longest side read as metres lies in 0.02..2, as centimetres in 2..100
-    and as millimetres above; the limits are 2 and 100.
-    """
-    if longest <= 2.0:
-        return "m"
-    return "cm" if longest <= 100.0 else "mm"
+    notes = (*file_mesh.notes, *unit_notes)
+    return ReadObject(mesh=mesh, T_obj_from_file=T_obj_from_file, unit=chosen, notes=notes)
 
 
 def _welded(
@@ -210,13 +181,7 @@ def _refuse_unusable(file_mesh: FileMesh, source: Path, config: ReadingConfig) -
             expected="a triangle mesh",
             action="Point clouds and curves must be meshed first.",
         )
-    if n_faces > config.max_faces:
-        raise ObjectError(
-            source,
-            f"has {n_faces:,} triangles",
-            expected=f"at most {config.max_faces:,}",
-            action="Decimate the mesh or raise `max_faces`.",
-        )
+    refuse_too_many_faces(n_faces, source, config.max_faces)
     used = file_mesh.verts_file[np.unique(file_mesh.faces)]
     bad = int((~np.isfinite(used)).any(axis=1).sum())
     if bad:
@@ -228,36 +193,43 @@ def _refuse_unusable(file_mesh: FileMesh, source: Path, config: ReadingConfig) -
         )
     if not np.ptp(used, axis=0).max() > 0.0:
         raise _no_extent(source)
-    for material in file_mesh.materials:
-        _refuse_bad_images(material, source, config)
 
 
-def _refuse_bad_images(material: Material, source: Path, config: ReadingConfig) -> None:
-    images = (
-        material.base_color_image,
-        material.metallic_roughness_image,
-        material.normal_image,
-        material.emissive_image,
+def _permitted_materials(
+    materials: tuple[Material, ...], source: Path, max_image_px: int
+) -> tuple[Material, ...]:
+    """The materials with images as glTF permits them, each image decoded once to see that it is whole."""
+    done: dict[bytes, bytes] = {}
+
+    def permitted(image: bytes | None, name: str) -> bytes | None:
+        if image is not None and image not in done:
+            done[image] = permitted_image(image, source, f"an image of material {name!r}", max_image_px)
+        return None if image is None else done[image]
+
+    return tuple(
+        replace(
+            material,
+            base_color_image=permitted(material.base_color_image, material.name),
+            metallic_roughness_image=permitted(material.metallic_roughness_image, material.name),
+            normal_image=permitted(material.normal_image, material.name),
+            emissive_image=permitted(material.emissive_image, material.name),
+        )
+        for material in materials
     )
-    for image in images:
-        if image is None:
-            continue
-        try:
-            opened = Image.open(io.BytesIO(image))
-            width, height = opened.size
-            if max(width, height) <= config.max_image_px:  # larger ones are not even unpacked
-                opened.load()
-        except Exception as error:  # Pillow raises whatever its decoders raise
-            raise ObjectError(
-                source,
-                f"an image of material {material.name!r} cannot be decoded ({error})",
-                expected="PNG, JPEG or WebP",
-                action="Save the image again.",
-            ) from error
-        if max(width, height) > config.max_image_px:
-            raise ObjectError(
-                source,
-                f"an image of material {material.name!r} is {width}x{height}",
-                expected=f"sides of at most {config.max_image_px} px",
-                action="Scale the image down or raise `max_image_px`.",
-            )
+
+
+def _tint(
+    corner_colors: Float[np.ndarray, "face 3 rgb"] | None, source: Path
+) -> Float[np.ndarray, "face 3 rgb"] | None:
+    """Factors 0..1; None where all are 1."""
+    if corner_colors is None:
+        return None
+    if not np.isfinite(corner_colors).all():
+        raise ObjectError(
+            source,
+            "has vertex colours that are NaN or infinite",
+            expected="colours in 0..1",
+            action="Export the mesh again, or without vertex colours.",
+        )
+    clipped = np.clip(corner_colors, 0.0, 1.0)
+    return None if (clipped == 1.0).all() else clipped

@@ -1,17 +1,17 @@
 """The container of glTF 2.0: JSON, buffers, accessors, images. Nothing here knows of meshes."""
 
-import base64
 import json
 import struct
-from pathlib import Path, PurePosixPath
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, urlsplit
 
 import numpy as np
 
 from datagen.objects.errors import ObjectError
+from datagen.objects.gltf.resources import SHOWN_CHARS, Resources
 
-__all__ = ["MAX_FILE_MB", "GltfFile", "damaged_gltf", "normalised", "open_gltf"]
+__all__ = ["MAX_FILE_MB", "UNPACKING", "GltfFile", "damaged_gltf", "normalised", "open_gltf"]
 
 # A million triangles as text (OBJ), or packed with several 8k images, take less.
 MAX_FILE_MB = 200.0
@@ -19,7 +19,12 @@ MAX_FILE_MB = 200.0
 DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 UNSIGNED = (5121, 5123, 5125)
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-SHOWN_CHARS = 200  # of what a file says, in messages
+SMALLEST_GLB = 20  # bytes of the header and of a chunk's
+# Extensions that pack bufferViews, and what unpacks them.
+UNPACKING = {
+    "EXT_meshopt_compression": "npx @gltf-transform/cli copy in.glb out.glb",
+    "KHR_meshopt_compression": "npx gltfpack -i in.glb -o out.glb -noq",
+}
 
 
 def damaged_gltf(path: Path, what: str) -> ObjectError:
@@ -47,10 +52,24 @@ class GltfFile:
     ) -> None:
         self.path = path
         self.json = document
-        self._is_glb = is_glb
         self._max_bytes = int(max_file_mb * 1e6)
-        self._glb_chunk = glb_chunk
-        self._buffers = [self._buffer(entry) for entry in document.get("buffers", [])]
+        self._resources = Resources(path=path, is_glb=is_glb, max_bytes=self._max_bytes)
+        self._images: dict[int, bytes] = {}
+        self._buffers = [
+            self._stated_buffer(index, entry, glb_chunk)
+            for index, entry in enumerate(document.get("buffers", []))
+        ]
+
+    def _stated_buffer(self, index: int, entry: dict[str, Any], glb_chunk: bytes | None) -> bytes | None:
+        """The bytes of one buffer; None where it has none, which only matters where they are wanted."""
+        if "uri" not in entry:
+            return glb_chunk if index == 0 else None
+        if not any(entry.get("extensions", {}).get(name, {}).get("fallback") for name in UNPACKING):
+            return self._resources.read(entry["uri"], "buffer")
+        try:  # gltfpack puts the plain copy beside a .glb too, and people leave it behind
+            return replace(self._resources, is_glb=False).read(entry["uri"], "buffer")
+        except ObjectError:
+            return None
 
     def damaged(self, what: str) -> ObjectError:
         """The error for a file that contradicts itself."""
@@ -68,57 +87,6 @@ class GltfFile:
             raise self.damaged(f"a {key} is {value!r} instead of a whole number from 0")
         return value
 
-    def _buffer(self, entry: dict[str, Any]) -> bytes:
-        if "uri" in entry:
-            return self._resource(entry["uri"], "buffer")
-        if self._glb_chunk is None:
-            raise self.damaged("a buffer has neither a uri nor a binary chunk")
-        return self._glb_chunk
-
-    def _resource(self, uri: str, kind: str) -> bytes:
-        if uri.startswith("data:"):
-            return self._inline(uri, kind)
-        shown = uri[:SHOWN_CHARS]
-        if self._is_glb:
-            raise ObjectError(
-                self.path,
-                f"refers to the {kind} {shown!r} outside of it",
-                expected="a .glb with everything inside",
-                action="Export one .glb again, or a .gltf with its files beside it.",
-            )
-        if _leaves_folder(uri):
-            raise ObjectError(
-                self.path,
-                f"refers to the {kind} {shown!r}",
-                expected="files in its own folder or below",
-                action="Put the file beside the .gltf and correct the uri, or export one .glb.",
-            )
-        path = self.path.parent / unquote(uri)
-        if not path.is_file():
-            raise ObjectError(
-                self.path,
-                f"{kind} {shown!r} is missing",
-                expected=f"a file at {path}",
-                action="Keep the files of a .gltf together, or export one .glb.",
-            )
-        if path.stat().st_size > self._max_bytes:
-            raise ObjectError(
-                self.path,
-                f"its {kind} {shown!r} has {path.stat().st_size / 1e6:.0f} MB",
-                expected=f"at most {self._max_bytes / 1e6:g} MB",
-                action="Make the model smaller or raise `max_file_mb`.",
-            )
-        return path.read_bytes()
-
-    def _inline(self, uri: str, kind: str) -> bytes:
-        header, _, payload = uri.partition(",")
-        try:
-            if not header.endswith(";base64"):
-                raise ValueError("not marked as base64")
-            return base64.b64decode(unquote(payload))
-        except ValueError as error:
-            raise self.damaged(f"the data uri of a {kind} cannot be decoded ({error})") from error
-
     def view(self, index: int) -> bytes:
         """The bytes of one bufferView."""
         return self._view(index)[0]
@@ -126,10 +94,25 @@ class GltfFile:
     def _view(self, index: int) -> tuple[bytes, int]:
         view = self.entry("bufferViews", index)
         start, length = self._whole(view, "byteOffset", 0), self._whole(view, "byteLength")
-        data = self._buffers[self._whole(view, "buffer")][start : start + length]
+        data = self._buffer(view)[start : start + length]
         if len(data) < length:
             raise self.damaged(f"bufferView {index} reaches beyond its buffer (file cut short?)")
         return data, self._whole(view, "byteStride", 0)
+
+    def _buffer(self, view: dict[str, Any]) -> bytes:
+        """What a bufferView is cut from; of packed ones the plain copy, if there is one (FORMATS 10.3)."""
+        data = self._buffers[self._whole(view, "buffer")]
+        if data is not None:
+            return data
+        packing = next((name for name in UNPACKING if name in view.get("extensions", {})), None)
+        if packing is None:
+            raise self.damaged("a buffer has neither a uri nor a binary chunk")
+        raise ObjectError(
+            self.path,
+            f"is packed with {packing}, without a plain copy",
+            expected="plain or Draco-compressed glTF 2.0",
+            action=f"Unpack it: `{UNPACKING[packing]}`.",
+        )
 
     def accessor(self, index: int) -> np.ndarray:
         """Rows of one accessor: floats where it is float or normalised, else its integers."""
@@ -171,11 +154,14 @@ class GltfFile:
         return rows
 
     def image(self, index: int) -> bytes:
-        """The encoded image file."""
+        """The encoded image file; the same object each time."""
         entry = self.entry("images", index)
-        if "uri" in entry:
-            return self._resource(entry["uri"], "texture")
-        return self.view(entry["bufferView"])
+        if index not in self._images:
+            uri = entry.get("uri")
+            self._images[index] = (
+                self.view(entry["bufferView"]) if uri is None else self._resources.read(uri, "texture")
+            )
+        return self._images[index]
 
 
 def normalised(rows: np.ndarray, accessor: dict[str, Any]) -> np.ndarray:
@@ -192,10 +178,17 @@ def open_gltf(path: Path, data: bytes, *, max_file_mb: float = MAX_FILE_MB) -> G
     text, is_glb = data, data[:4] == b"glTF"
     if is_glb:
         text, chunk = _glb_chunks(path, data)
+    return GltfFile(path, _document(path, text), chunk, max_file_mb, is_glb=is_glb)
+
+
+def _document(path: Path, text: bytes) -> dict[str, Any]:
+    """The JSON part. Encodings with a byte order mark are read; letters that are none become signs."""
     try:
-        document = json.loads(text)
-        version = str(document["asset"]["version"])
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        document = json.loads(text.decode(json.detect_encoding(text), errors="replace"))
+        # Collections were dictionaries by name in glTF 1.0, lists since.
+        is_first = any(isinstance(document.get(kind), dict) for kind in ("buffers", "meshes", "nodes"))
+        version = "1.0" if is_first else str(document["asset"]["version"])
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ObjectError(
             path,
             f"is not glTF ({error})",
@@ -203,21 +196,28 @@ def open_gltf(path: Path, data: bytes, *, max_file_mb: float = MAX_FILE_MB) -> G
             action="Check that the file is what its name says.",
         ) from error
     if not version.startswith("2"):
-        raise ObjectError(path, f"is glTF {version}", expected="glTF 2.0", action="Convert it with Blender.")
-    return GltfFile(path, document, chunk, max_file_mb, is_glb=is_glb)
+        raise _old_version(path, version)
+    return document
 
 
-def _leaves_folder(uri: str) -> bool:
-    """Whether a uri is no plain path below the file's own folder (".." and backslashes included)."""
-    parts = urlsplit(uri)
-    path = PurePosixPath(unquote(uri).replace("\\", "/"))
-    return bool(parts.scheme or parts.netloc) or path.is_absolute() or ".." in path.parts
+def _old_version(path: Path, version: str) -> ObjectError:
+    return ObjectError(
+        path,
+        f"is glTF {version}",
+        expected="glTF 2.0",
+        action="Convert it: `npx gltf-pipeline -i old.gltf -o new.glb` (a .glb in place of the .gltf will do).",
+    )
 
 
 def _glb_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
+    if len(data) >= 12 and data[4:8] == b"\1\0\0\0":
+        raise _old_version(path, "1.0")
+    stated = int.from_bytes(data[8:12], "little")
+    # What follows the stated length is not of the file; some writers state too little.
+    end = stated if SMALLEST_GLB <= stated <= len(data) else len(data)
     offset = 12
     chunks: dict[bytes, bytes] = {}
-    while offset + 8 <= len(data):
+    while offset + 8 <= end:
         length, kind = struct.unpack_from("<I4s", data, offset)
         chunk = data[offset + 8 : offset + 8 + length]
         if len(chunk) < length:
@@ -229,4 +229,5 @@ def _glb_chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
             )
         chunks.setdefault(kind, chunk)
         offset += 8 + length
-    return chunks.get(b"JSON", b""), chunks.get(b"BIN\0")
+    # Spaces are the padding that the format wants; some writers fill up with zeros.
+    return chunks.get(b"JSON", b"").rstrip(b"\0 \t\r\n"), chunks.get(b"BIN\0")

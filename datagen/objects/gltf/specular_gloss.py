@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from datagen.objects.gltf.texture_images import decoded_rgba
 from shards.color import linear_from_srgb, srgb_from_linear
 
 __all__ = ["MetallicRoughness", "SpecularGloss", "metallic_roughness"]
@@ -27,7 +28,7 @@ ROWS_AT_ONCE = 128
 
 @dataclass(frozen=True, kw_only=True)
 class SpecularGloss:
-    """The extension's values; images are encoded files (sRGB colour, linear alpha)."""
+    """The extension's values; images are PNG or JPEG files (sRGB colour, linear alpha)."""
 
     diffuse_rgba: tuple[float, float, float, float]  # linear
     diffuse_image: bytes | None
@@ -101,7 +102,7 @@ def _converted(
 def _converted_images(look: SpecularGloss) -> tuple[bytes, bytes]:
     """PNGs of base colour (alpha kept) and of glTF's metallic-roughness (G roughness, B metallic)."""
     opened = [
-        None if image is None else Image.open(io.BytesIO(image)).convert("RGBA")
+        None if image is None else decoded_rgba(image)
         for image in (look.diffuse_image, look.specular_gloss_image)
     ]
     size = max((image.size for image in opened if image is not None), key=lambda side: side[0] * side[1])

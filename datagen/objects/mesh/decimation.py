@@ -1,6 +1,4 @@
-"""Fewer triangles for the drawn mesh; UVs and materials are carried over chart by chart."""
-
-from dataclasses import replace
+"""Fewer triangles for the drawn mesh; UVs, colours and materials are carried over chart by chart."""
 
 import fast_simplification
 import igl
@@ -18,8 +16,8 @@ def decimated_mesh(mesh: ObjectMesh, max_faces: int) -> ObjectMesh:
     """About `max_faces` triangles by quadric edge collapse; unchanged if there are fewer.
 
     Each new triangle takes the UV chart (a connected piece of the UV map, of one material) of
-    the old triangle nearest to its centre; its corners take the UV of the nearest point of that
-    chart. Colours may shift by a texel along seams.
+    the old triangle nearest to its centre; its corners take UV and colour of the nearest point of
+    that chart. Colours may shift by a texel along seams.
     """
     if len(mesh.faces) <= max_faces:
         return mesh
@@ -35,16 +33,21 @@ def decimated_mesh(mesh: ObjectMesh, max_faces: int) -> ObjectMesh:
     _, nearest_face, _ = igl.point_mesh_squared_distance(verts[faces].mean(axis=1), old_verts, old_faces)
     nearest_face = nearest_face.astype(np.int64)
     chart_of_face = chart[nearest_face]
-    corner_uv = np.zeros((len(faces), 3, 2))
+    old_face, barycentric = np.zeros((len(faces), 3), np.int64), np.zeros((len(faces), 3, 3))
     for index in np.unique(chart_of_face):
         chosen = chart_of_face == index
         members = np.flatnonzero(chart == index)
-        corner_uv[chosen] = _nearest_uv(mesh, members, verts[faces[chosen]].reshape(-1, 3)).reshape(-1, 3, 2)
-    return replace(
-        mesh,
+        found, weights = _nearest_on_faces(mesh, members, verts[faces[chosen]].reshape(-1, 3))
+        old_face[chosen], barycentric[chosen] = found.reshape(-1, 3), weights.reshape(-1, 3, 3)
+
+    def at_new_corners(rows: Float[np.ndarray, "old_face 3 column"]) -> Float[np.ndarray, "face 3 column"]:
+        weights, corners = barycentric.reshape(-1, 3), rows[old_face.reshape(-1)]
+        return np.einsum("pk,pkc->pc", weights, corners).reshape(len(faces), 3, -1)
+
+    return mesh.with_corners(
+        at_new_corners,
         verts_obj=verts,
         faces=faces,
-        corner_uv=corner_uv,
         face_material=mesh.face_material[nearest_face],
     )
 
@@ -68,9 +71,10 @@ def _charts(mesh: ObjectMesh) -> Int[np.ndarray, " face"]:
     return connected_components(graph, directed=False)[1][node[:, 0]].astype(np.int64)
 
 
-def _nearest_uv(
+def _nearest_on_faces(
     mesh: ObjectMesh, members: Int[np.ndarray, " member"], points: Float[np.ndarray, "point 3"]
-) -> Float[np.ndarray, "point 2"]:
+) -> tuple[Int[np.ndarray, " point"], Float[np.ndarray, "point 3"]]:
+    """The nearest point among some faces of the mesh: its face and barycentric coordinates."""
     old_verts = np.ascontiguousarray(mesh.verts_obj)
     member_faces = np.ascontiguousarray(mesh.faces[members])
     _, face, nearest = igl.point_mesh_squared_distance(points, old_verts, member_faces)
@@ -78,4 +82,4 @@ def _nearest_uv(
     barycentric = igl.barycentric_coordinates(
         nearest, *(np.ascontiguousarray(triangle[:, k]) for k in range(3))
     )
-    return np.einsum("pk,pkc->pc", np.clip(barycentric, 0.0, 1.0), mesh.corner_uv[members[face]])
+    return members[face], np.clip(barycentric, 0.0, 1.0)

@@ -1,7 +1,5 @@
 """Triangles that face outward, each drawn once."""
 
-from dataclasses import replace
-
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -28,7 +26,7 @@ def outward_mesh(mesh: ObjectMesh) -> ObjectMesh:
     """The same surface with repeated triangles removed and every patch facing outward.
 
     A patch is what manifold edges connect. Its outside is the side from which more rays escape;
-    where both sides are alike (a leaf) the file's own orientation stays. UVs move with corners.
+    where both sides are alike (a leaf) the file's own orientation stays. UVs and colours move with corners.
     """
     mesh = _without_repeats(mesh)
     oriented, patch = igl.bfs_orient(np.ascontiguousarray(mesh.faces, dtype=np.int64))
@@ -43,10 +41,9 @@ def outward_mesh(mesh: ObjectMesh) -> ObjectMesh:
     inward = _inward_patches(mesh, patch, flipped, areas)
     flipped ^= inward[patch]
     order = np.where(flipped[:, None], [[2, 1, 0]], [[0, 1, 2]])
-    return replace(
-        mesh,
+    return mesh.with_corners(
+        lambda rows: np.take_along_axis(rows, order[..., None], axis=1),
         faces=np.take_along_axis(mesh.faces, order, axis=1),
-        corner_uv=np.take_along_axis(mesh.corner_uv, order[..., None], axis=1),
     )
 
 
@@ -54,11 +51,8 @@ def _without_repeats(mesh: ObjectMesh) -> ObjectMesh:
     """Triangles over the same three vertices are kept once: drawn twice they flicker."""
     _, first = np.unique(np.sort(mesh.faces, axis=1), axis=0, return_index=True)
     kept = np.sort(first)
-    return replace(
-        mesh,
-        faces=mesh.faces[kept],
-        corner_uv=mesh.corner_uv[kept],
-        face_material=mesh.face_material[kept],
+    return mesh.with_corners(
+        lambda rows: rows[kept], faces=mesh.faces[kept], face_material=mesh.face_material[kept]
     )
 
 

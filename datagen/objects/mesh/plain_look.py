@@ -48,7 +48,7 @@ class _Look:
 
 
 def with_plain_look(mesh: ObjectMesh, name: str) -> ObjectMesh:
-    """The mesh in one generated material, chosen by `name` alone. UVs are replaced."""
+    """The mesh in one generated material, chosen by `name` alone. UVs and colours are replaced."""
     digest = hashlib.sha256(f"plain look {name}".encode()).digest()
     rng = np.random.default_rng(int.from_bytes(digest[:8], "little"))
     look = LOOKS[int(rng.integers(len(LOOKS)))](rng)
@@ -63,6 +63,8 @@ def with_plain_look(mesh: ObjectMesh, name: str) -> ObjectMesh:
     return replace(
         mesh,
         corner_uv=_box_projected(mesh),
+        more_corner_uv=(),
+        corner_colors=None,
         face_material=np.zeros(len(mesh.faces), dtype=np.int64),
         materials=(material,),
     )

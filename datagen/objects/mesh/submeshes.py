@@ -1,7 +1,5 @@
 """Taking a drawn mesh apart."""
 
-from dataclasses import replace
-
 import igl
 import numpy as np
 from jaxtyping import Bool, Int
@@ -15,11 +13,10 @@ def sub_mesh(mesh: ObjectMesh, kept: Bool[np.ndarray, " face"]) -> ObjectMesh:
     """The chosen faces alone; the frame's origin moves to their bbox centre."""
     used, compact = np.unique(mesh.faces[kept], return_inverse=True)
     verts = mesh.verts_obj[used]
-    return replace(
-        mesh,
+    return mesh.with_corners(
+        lambda rows: rows[kept],
         verts_obj=verts - 0.5 * (verts.min(axis=0) + verts.max(axis=0)),
         faces=compact.reshape(-1, 3),
-        corner_uv=mesh.corner_uv[kept],
         face_material=mesh.face_material[kept],
     )
 

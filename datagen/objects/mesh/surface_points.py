@@ -4,10 +4,10 @@ import io
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from PIL import Image
 
-from datagen.objects.mesh.object_mesh import Material, ObjectMesh
+from datagen.objects.mesh.object_mesh import ImageLayout, ObjectMesh, Wrap
 from shards.color import linear_from_srgb, srgb_from_linear
 
 __all__ = [
@@ -53,44 +53,91 @@ def face_normals(
     return np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
 
 
-def _image_colors(image: bytes, uv: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
-    """Linear colours at `uv` (repeating image, bilinear between texel centres)."""
-    pixels = np.asarray(Image.open(io.BytesIO(image)).convert("RGB"), dtype=np.float64) / 255.0
-    pixels = linear_from_srgb(pixels)
+def colors_at(
+    mesh: ObjectMesh, face: Int[np.ndarray, " point"], barycentric: Float[np.ndarray, "point 3"]
+) -> Float[np.ndarray, "point 3"]:
+    """sRGB colour without lighting (0..1) of points given by face and barycentric coordinates.
+
+    The base colour (factor, image and corner colours multiplied), or what glows where that is
+    brighter, channel by channel: files with baked light are black but for their emissive image.
+    """
+
+    def at_points(rows: Float[np.ndarray, "face 3 column"]) -> Float[np.ndarray, "point column"]:
+        return np.einsum("pk,pkc->pc", barycentric, rows[face].astype(np.float64))
+
+    uv_layers = [at_points(uv) for uv in (mesh.corner_uv, *mesh.more_corner_uv)]
+    tint = None if mesh.corner_colors is None else at_points(mesh.corner_colors)
+    material_of_point = mesh.face_material[face]
+    colors = np.zeros((len(face), 3))
+    for index, material in enumerate(mesh.materials):
+        chosen = material_of_point == index
+        if not chosen.any():
+            continue
+        base = _shown(
+            material.base_color_rgba[:3],
+            material.base_color_image,
+            material.base_color_layout,
+            uv_layers,
+            chosen,
+        )
+        linear = base if tint is None else base * tint[chosen]
+        if any(material.emissive_rgb):
+            glow = _shown(
+                material.emissive_rgb, material.emissive_image, material.emissive_layout, uv_layers, chosen
+            )
+            linear = np.maximum(linear, glow)
+        colors[chosen] = srgb_from_linear(linear)
+    return colors
+
+
+def _shown(
+    factor: tuple[float, ...],
+    image: bytes | None,
+    layout: ImageLayout,
+    uv_layers: list[Float[np.ndarray, "all_point 2"]],
+    chosen: Bool[np.ndarray, " all_point"],
+) -> Float[np.ndarray, "point 3"]:
+    """Linear factor times image at the chosen points."""
+    uv = uv_layers[layout.uv_layer][chosen]
+    linear = np.broadcast_to(np.asarray(factor, dtype=np.float64), (len(uv), 3))
+    return linear if image is None else linear * _image_colors(image, uv, layout)
+
+
+def _image_colors(
+    image: bytes, uv: Float[np.ndarray, "point 2"], layout: ImageLayout
+) -> Float[np.ndarray, "point 3"]:
+    """Linear colours at `uv`, bilinear between texel centres."""
+    pixels = np.asarray(Image.open(io.BytesIO(image)).convert("RGB"))
     height, width = pixels.shape[:2]
-    x = np.mod(uv[:, 0], 1.0) * width - 0.5
-    y = (1.0 - np.mod(uv[:, 1], 1.0)) * height - 0.5
+    x = _folded(uv[:, 0], layout.wrap_u) * width - 0.5
+    y = (1.0 - _folded(uv[:, 1], layout.wrap_v)) * height - 0.5
     x0, y0 = np.floor(x).astype(int), np.floor(y).astype(int)
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
 
     def texel(dy: int, dx: int) -> Float[np.ndarray, "point 3"]:
-        return pixels[(y0 + dy) % height, (x0 + dx) % width]
+        row, column = _wrapped(y0 + dy, height, layout.wrap_v), _wrapped(x0 + dx, width, layout.wrap_u)
+        return linear_from_srgb(pixels[row, column] / 255.0)
 
     top = (1 - fx) * texel(0, 0) + fx * texel(0, 1)
     bottom = (1 - fx) * texel(1, 0) + fx * texel(1, 1)
     return (1 - fy) * top + fy * bottom
 
 
-def _material_colors(material: Material, uv: Float[np.ndarray, "point 2"]) -> Float[np.ndarray, "point 3"]:
-    factor = np.asarray(material.base_color_rgba[:3], dtype=np.float64)
-    linear = np.broadcast_to(factor, (len(uv), 3))
-    if material.base_color_image is not None:
-        linear = linear * _image_colors(material.base_color_image, uv)
-    return srgb_from_linear(linear)
+def _folded(coordinate: Float[np.ndarray, " point"], wrap: Wrap) -> Float[np.ndarray, " point"]:
+    """An equivalent coordinate near 0..1, as coordinates in files may be huge."""
+    if wrap == "clamp":
+        return np.clip(coordinate, -1.0, 2.0)
+    return np.mod(coordinate, 2.0 if wrap == "mirror" else 1.0)
 
 
-def colors_at(
-    mesh: ObjectMesh, face: Int[np.ndarray, " point"], barycentric: Float[np.ndarray, "point 3"]
-) -> Float[np.ndarray, "point 3"]:
-    """sRGB base colour (0..1) of points given by face and barycentric coordinates."""
-    uv = np.einsum("pk,pkc->pc", barycentric, mesh.corner_uv[face].astype(np.float64))
-    material_of_point = mesh.face_material[face]
-    colors = np.zeros((len(face), 3))
-    for index, material in enumerate(mesh.materials):
-        chosen = material_of_point == index
-        if chosen.any():
-            colors[chosen] = _material_colors(material, uv[chosen])
-    return colors
+def _wrapped(index: Int[np.ndarray, " point"], count: int, wrap: Wrap) -> Int[np.ndarray, " point"]:
+    """The texel that is seen at an index beyond the image."""
+    if wrap == "clamp":
+        return np.clip(index, 0, count - 1)
+    if wrap == "repeat":
+        return index % count
+    within = index % (2 * count)
+    return np.where(within < count, within, 2 * count - 1 - within)
 
 
 def sample_surface(

@@ -19,11 +19,12 @@ from datagen.objects.catalogue.description import Appearance, ObjectDescription
 from datagen.objects.catalogue.licences import UNKNOWN_LICENCE, joined_licences
 from datagen.objects.errors import ObjectError
 from datagen.objects.formats.reading import ReadingConfig, ReadObject, read_object
+from datagen.objects.mesh.mesh_measures import MeshMeasures, measure_mesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.outward_faces import outward_mesh
 from datagen.objects.mesh.plain_look import with_plain_look
 from datagen.objects.mesh.registration import Registration, RegistrationConfig, register
-from datagen.objects.mesh.texture_quality import TextureQuality, measure_texture_quality
+from datagen.objects.mesh.texture_quality import measure_texture_quality
 from datagen.objects.stores.objaverse import ObjaverseAnnotation, ObjaverseStore
 from datagen.objects.watertight.preparation import PreparationConfig, cached_watertight
 
@@ -149,11 +150,15 @@ class GraspXLObjects:
         note = self._note(file)
         return ObjectDescription(licence=_bare_licence(note), annotation=note, appearance="generated")
 
-    def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the watertight mesh."""
+    def measure(self, uid: str) -> MeshMeasures:
+        """Of the mesh that `load` would draw, without making the watertight mesh."""
         file = self._file(uid)
-        drawn = self._drawn(read_object(file, self._reading), file)
-        return measure_texture_quality(drawn.texture_source)
+        read = read_object(file, self._reading)
+        return measure_mesh(self._drawn(read, file).texture_source, notes=read.notes)
+
+    def notes(self) -> tuple[str, ...]:
+        """None: the folders are used as they are."""
+        return ()
 
     def _file(self, uid: str) -> Path:
         parts = UID.fullmatch(uid)

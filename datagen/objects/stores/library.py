@@ -1,9 +1,9 @@
-"""Object libraries: the starter pack in this package, a folder of meshes, Sweet Home 3D."""
+"""Object libraries: their interface, the starter pack in this package, Sweet Home 3D."""
 
-import csv
 import io
 import json
 import zipfile
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -12,18 +12,18 @@ import numpy as np
 
 from datagen.objects.asset.object_asset import ObjectAsset
 from datagen.objects.catalogue.description import ObjectDescription
-from datagen.objects.catalogue.licences import UNKNOWN_LICENCE, joined_licences, licence_parts, spdx_of
 from datagen.objects.errors import ObjectError
-from datagen.objects.formats.reading import MESH_SUFFIXES, ReadingConfig, ReadObject, object_mesh, read_object
+from datagen.objects.formats.reading import ReadingConfig, ReadObject, object_mesh
 from datagen.objects.gltf.scene import read_gltf
 from datagen.objects.mesh.graspable_size import holdable_scale, scaled_mesh
+from datagen.objects.mesh.mesh_measures import MeshMeasures, measure_mesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.outward_faces import outward_mesh
 from datagen.objects.mesh.texture_quality import TextureQuality, measure_texture_quality
 from datagen.objects.stores.sweethome3d import CatalogueEntry, find_libraries, read_catalogue, read_model
 from datagen.objects.watertight.preparation import PreparationConfig, cached_watertight, watertight_from_bytes
 
-__all__ = ["REFERENCE_READING", "MeshFolder", "ObjectLibrary", "StarterPack", "Sweethome3D"]
+__all__ = ["REFERENCE_READING", "ObjectLibrary", "StarterPack", "Sweethome3D", "unknown_object"]
 
 # Unit-less files: the "auto" rule; OBJ, PLY and STL with Y up, as most exporters write OBJ.
 REFERENCE_READING = ReadingConfig(unit="auto", up_axis="y", max_faces=1_000_000, max_image_px=8192)
@@ -42,11 +42,15 @@ class ObjectLibrary(Protocol):
     def describe(self, uid: str) -> ObjectDescription:
         """What is known without reading the mesh; ObjectError where the uid is unknown."""
 
-    def texture_quality(self, uid: str) -> TextureQuality:
-        """The `texture` that `load` would give, without its costly parts."""
+    def measure(self, uid: str) -> MeshMeasures:
+        """What a selection rests on, without the costly parts of `load`; its `texture` is that of `load`."""
+
+    def notes(self) -> tuple[str, ...]:
+        """What was left out, guessed or joined when the library was opened, one line each."""
 
 
-def _unknown(where: object, uid: str) -> ObjectError:
+def unknown_object(where: object, uid: str) -> ObjectError:
+    """For a uid that is not one of a library's."""
     return ObjectError(
         where, f"has no object {uid!r}", expected="one of its uids()", action="List the uids and pick one."
     )
@@ -68,10 +72,8 @@ class StarterPack:
 
     def load(self, uid: str) -> ObjectAsset:
         """One starter object; nothing is computed, only unpacked."""
-        entry = self._entry(uid)
-        slug = uid.partition("/")[2]
-        file_mesh = read_gltf(Path(f"{slug}.glb"), self._archive.read(f"{slug}.glb"))
-        read = object_mesh(file_mesh, Path(uid), REFERENCE_READING, unit="m", up_axis="y")
+        entry, slug = self._entry(uid), _slug(uid)
+        read = self._read(uid)
         return ObjectAsset(
             uid=uid,
             name=entry["name"],
@@ -90,117 +92,28 @@ class StarterPack:
         """From the pack's index."""
         return ObjectDescription(licence=self._entry(uid)["licence"])
 
-    def texture_quality(self, uid: str) -> TextureQuality:
-        """From the pack's index."""
-        return TextureQuality(**self._entry(uid)["texture"])
+    def measure(self, uid: str) -> MeshMeasures:
+        """The texture is that of the pack's index."""
+        texture = TextureQuality(**self._entry(uid)["texture"])
+        return replace(measure_mesh(self._read(uid).mesh), texture=texture)
+
+    def notes(self) -> tuple[str, ...]:
+        """None: the pack is complete."""
+        return ()
+
+    def _read(self, uid: str) -> ReadObject:
+        slug = _slug(uid)
+        file_mesh = read_gltf(Path(f"{slug}.glb"), self._archive.read(f"{slug}.glb"))
+        return object_mesh(file_mesh, Path(uid), REFERENCE_READING, unit="m", up_axis="y")
 
     def _entry(self, uid: str) -> dict[str, Any]:
         if uid not in self._entries:
-            raise _unknown("starter pack", uid)
+            raise unknown_object("starter pack", uid)
         return self._entries[uid]
 
 
-class MeshFolder:
-    """Every GLB, GLTF, OBJ, PLY and STL below a folder; uid "folder/<relative path>".
-
-    A file `objects.csv` in the folder may tell more: columns path, name, licence (as `spdx_of`
-    takes it), author, url. What it does not tell is "NOASSERTION".
-    """
-
-    def __init__(
-        self, path: Path, reading: ReadingConfig, preparation: PreparationConfig, cache_dir: Path
-    ) -> None:
-        if not path.is_dir():
-            raise ObjectError(
-                path, "is not a folder", expected="a folder of meshes", action="Check the path."
-            )
-        self._path, self._reading = path, reading
-        self._preparation, self._cache_dir = preparation, cache_dir.expanduser()
-        self._files = {
-            f"folder/{file.relative_to(path).as_posix()}": file
-            for file in sorted(path.rglob("*"))
-            if file.suffix.lower() in MESH_SUFFIXES and file.is_file()
-        }
-        if not self._files:
-            raise ObjectError(
-                path,
-                "holds no meshes",
-                expected=f"files ending in {', '.join(MESH_SUFFIXES)}",
-                action="Check the path.",
-            )
-        self._notes = _folder_notes(path / "objects.csv")
-
-    def uids(self) -> tuple[str, ...]:
-        """ "folder/<relative path>" of every mesh file, sorted."""
-        return tuple(self._files)
-
-    def load(self, uid: str) -> ObjectAsset:
-        """Read, repair and prepare one mesh; watertight meshes come from the cache the second time."""
-        file, note = self._file(uid), self._note(uid)
-        read = read_object(file, self._reading)
-        mesh = outward_mesh(read.mesh)
-        return ObjectAsset(
-            uid=uid,
-            name=note.get("name") or file.stem,
-            source="folder",
-            licence=self.describe(uid).licence,
-            author=note.get("author") or "unknown",
-            url=note.get("url") or "",
-            mesh=mesh,
-            watertight=cached_watertight(mesh, self._preparation, self._cache_dir, source=file),
-            catalogue_scale=1.0,
-            texture=measure_texture_quality(mesh),
-            T_obj_from_file=read.T_obj_from_file,
-        )
-
-    def describe(self, uid: str) -> ObjectDescription:
-        """From `objects.csv`."""
-        self._file(uid)  # names what is not there
-        return ObjectDescription(licence=self._note(uid).get("licence") or UNKNOWN_LICENCE)
-
-    def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the watertight mesh."""
-        return measure_texture_quality(outward_mesh(read_object(self._file(uid), self._reading).mesh))
-
-    def _file(self, uid: str) -> Path:
-        if uid not in self._files:
-            raise _unknown(self._path, uid)
-        return self._files[uid]
-
-    def _note(self, uid: str) -> dict[str, str]:
-        return self._notes.get(uid.partition("/")[2], {})
-
-
-def _folder_notes(path: Path) -> dict[str, dict[str, str]]:
-    if not path.is_file():
-        return {}
-    with path.open(encoding="utf-8", newline="") as handle:
-        rows = list(csv.DictReader(handle))
-    if rows and "path" not in rows[0]:
-        raise ObjectError(
-            path,
-            "has no column 'path'",
-            expected="columns path, name, licence, author, url",
-            action="Add the header line.",
-        )
-    return {
-        row["path"]: {**row, "licence": _licence_of_row(path, number, row)}
-        for number, row in enumerate(rows, start=2)  # the header is row 1
-    }
-
-
-def _licence_of_row(path: Path, number: int, row: dict[str, str]) -> str:
-    """SPDX id (or several joined by AND); empty where the row does not tell."""
-    written = (row.get("licence") or "").strip()
-    try:
-        return joined_licences(*map(spdx_of, licence_parts(written))) if written else ""
-    except ObjectError as error:
-        raise ObjectError(
-            path,
-            f"row {number} ({row['path']}): the licence {written!r} is not known",
-            expected=error.expected,
-            action=error.action,
-        ) from error
+def _slug(uid: str) -> str:
+    return uid.partition("/")[2]
 
 
 # Furniture is beyond a hand even as a miniature; and these are fixtures, not things one picks up.
@@ -252,13 +165,18 @@ class Sweethome3D:
         """From the catalogue."""
         return ObjectDescription(licence=self._entry(uid)[1].licence)
 
-    def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the watertight mesh."""
-        return measure_texture_quality(self._read(uid)[2])
+    def measure(self, uid: str) -> MeshMeasures:
+        """Of the mesh that `load` would draw, without making the watertight mesh."""
+        read, _, mesh = self._read(uid)
+        return measure_mesh(mesh, notes=read.notes)
+
+    def notes(self) -> tuple[str, ...]:
+        """None: what is no household model is left out by rule."""
+        return ()
 
     def _entry(self, uid: str) -> tuple[Path, CatalogueEntry]:
         if uid not in self._entries:
-            raise _unknown("sweethome3d", uid)
+            raise unknown_object("sweethome3d", uid)
         return self._entries[uid]
 
     def _read(self, uid: str) -> tuple[ReadObject, float, ObjectMesh]:

@@ -26,9 +26,10 @@ from datagen.objects.catalogue.objaverse_annotation import ObjaverseAnnotation, 
 from datagen.objects.errors import ObjectError
 from datagen.objects.formats.reading import ReadingConfig, ReadObject, read_object
 from datagen.objects.mesh.graspable_size import fitted_scale, scaled_mesh
+from datagen.objects.mesh.mesh_measures import MeshMeasures, measure_mesh
 from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.outward_faces import outward_mesh
-from datagen.objects.mesh.texture_quality import TextureQuality, measure_texture_quality
+from datagen.objects.mesh.texture_quality import measure_texture_quality
 from datagen.objects.watertight.preparation import PreparationConfig, cached_watertight
 
 __all__ = ["ObjaverseAnnotation", "ObjaverseStore", "objaverse_root"]
@@ -131,9 +132,14 @@ class ObjaverseStore:
         note = self.annotation(uid)
         return ObjectDescription(licence=note.licence if note else UNKNOWN_LICENCE, annotation=note)
 
-    def texture_quality(self, uid: str) -> TextureQuality:
-        """As `load` measures it, without making the watertight mesh."""
-        return measure_texture_quality(self._read(self.glb_path(uid))[2])
+    def measure(self, uid: str) -> MeshMeasures:
+        """Of the mesh that `load` would draw, without making the watertight mesh."""
+        read, _, mesh = self._read(self.glb_path(uid))
+        return measure_mesh(mesh, notes=read.notes)
+
+    def notes(self) -> tuple[str, ...]:
+        """None: a store is used as it is."""
+        return ()
 
     def _read(self, path: Path) -> tuple[ReadObject, float, ObjectMesh]:
         """The file, its scale, and the drawn mesh at that scale."""
@@ -231,7 +237,7 @@ def _walk(root: Path) -> Iterator[tuple[str, str]]:
     for folder in os.scandir(root / "glbs"):
         if folder.is_dir():
             for entry in os.scandir(folder):
-                if entry.name.endswith(".glb") and entry.is_file():
+                if entry.name.endswith(".glb") and not entry.name.startswith(".") and entry.is_file():
                     yield entry.name.removesuffix(".glb"), folder.name
 
 

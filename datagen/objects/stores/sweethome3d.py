@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.objects.errors import ObjectError
-from datagen.objects.formats.wavefront import read_obj
+from datagen.objects.gltf.container import MAX_FILE_MB
 from datagen.objects.mesh.file_mesh import FileMesh
+from datagen.objects.wavefront.obj_file import read_obj
 
 __all__ = ["CatalogueEntry", "find_libraries", "read_catalogue", "read_model"]
 
@@ -115,7 +116,7 @@ def read_model(library: Path, entry: CatalogueEntry) -> FileMesh:
                     target.write_bytes(archive.read(name))
         # A few published models name images that were never part of them; Sweet Home 3D
         # shows those materials in their plain colour.
-        file_mesh = read_obj(Path(folder, entry.model), ignore_missing_images=True)
+        file_mesh = read_obj(Path(folder, entry.model), max_file_mb=MAX_FILE_MB, ignore_missing_images=True)
     verts = file_mesh.verts_file @ entry.rotation.T
     used = verts[np.unique(file_mesh.faces)]
     extent = np.ptp(used, axis=0)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from scipy.stats import qmc
 
-from model.structured_latent.object_features.object_mesh import TexturedMesh
+from model.structured_latent.object_features.object_mesh import TexturedMesh, Wrap
 from model.surface.rasteriser import rasterise
 from shards.color import linear_from_srgb, srgb_from_linear
 from shards.geometry import intrinsics_from_fov, look_at
@@ -22,7 +22,7 @@ __all__ = ["RENDERING", "ObjectView", "object_views", "sphere_cameras"]
 FOV_DEG, RADIUS = 40.0, 2.0  # canonical units
 AMBIENT = 0.5  # share of the light that comes from everywhere
 REFLECTANCE = 0.04  # of what is not metal: black things do not vanish before the black
-RENDERING = f"views 1: {FOV_DEG} {RADIUS} {AMBIENT} {REFLECTANCE}"
+RENDERING = f"views 2: {FOV_DEG} {RADIUS} {AMBIENT} {REFLECTANCE}"
 """Changes with anything that changes the images of an object: part of what a cached feature is known by."""
 
 _MAX_LEVELS = 16  # of an image of 65,535 texels across
@@ -108,9 +108,10 @@ def _image(
     color = mixed(mesh.colors)
     choice, uv = mesh.face_texture[face] * _MAX_LEVELS + level, mixed(mesh.uv)
     for found in np.flatnonzero(np.bincount(choice)):
-        level_image = pyramids[found // _MAX_LEVELS][found % _MAX_LEVELS]
+        texture = found // _MAX_LEVELS
+        level_image = pyramids[texture][found % _MAX_LEVELS]
         pixels = np.flatnonzero(choice == found)
-        color[pixels] *= _texels(level_image, uv[pixels])
+        color[pixels] *= _texels(level_image, uv[pixels], mesh.wraps[texture])
     image = np.zeros((size, size, 3), dtype=np.float32)
     light = AMBIENT + (1.0 - AMBIENT) * facing
     image[hit] = srgb_from_linear((REFLECTANCE + (1.0 - REFLECTANCE) * color) * light[:, None])
@@ -151,9 +152,9 @@ def _edges(corners: Float[np.ndarray, "face 3 2"]) -> Float[np.ndarray, "face 2 
 
 
 def _texels(
-    image: UInt8[np.ndarray, "height width 3"], uv: Float[np.ndarray, "pixel 2"]
+    image: UInt8[np.ndarray, "height width 3"], uv: Float[np.ndarray, "pixel 2"], wraps: tuple[Wrap, Wrap]
 ) -> Float32[np.ndarray, "pixel 3"]:
-    """Linear light between the four nearest texels; the image repeats."""
+    """Linear light between the four nearest texels."""
     height, width = image.shape[:2]
     x, y = uv[:, 0] * width - 0.5, (1.0 - uv[:, 1]) * height - 0.5
     column, row = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
@@ -162,8 +163,18 @@ def _texels(
     def at(
         row: Int[np.ndarray, " pixel"], column: Int[np.ndarray, " pixel"]
     ) -> Float32[np.ndarray, "pixel 3"]:
-        return _LINEAR[image[row % height, column % width]]
+        return _LINEAR[image[_wrapped(row, height, wraps[1]), _wrapped(column, width, wraps[0])]]
 
     above = (1.0 - right) * at(row, column) + right * at(row, column + 1)
     below = (1.0 - right) * at(row + 1, column) + right * at(row + 1, column + 1)
     return ((1.0 - down) * above + down * below).astype(np.float32)
+
+
+def _wrapped(index: Int[np.ndarray, " pixel"], count: int, wrap: Wrap) -> Int[np.ndarray, " pixel"]:
+    """The texel that is seen at an index beyond the image."""
+    if wrap == "clamp":
+        return np.clip(index, 0, count - 1)
+    if wrap == "repeat":
+        return index % count
+    within = index % (2 * count)
+    return np.where(within < count, within, 2 * count - 1 - within)

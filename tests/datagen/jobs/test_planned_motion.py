@@ -1,5 +1,6 @@
 """Simulated motions of left hands, and objects that turn out to be unusable."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ def test_a_simulated_left_hand_grasps_the_object_itself(tmp_path: Path):
         [[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]],
     )
     wedge.export(tmp_path / "meshes" / "wedge.ply")
-    motion = line("folder/wedge.ply", side="left")
+    motion = line("folder/wedge", side="left")
     asset = load_object(config, motion)
     source = open_hand(config.hand)
     sequence = drawn_sequence(config, motion, source.right, asset)
@@ -67,18 +68,18 @@ def test_a_simulated_left_hand_grasps_the_object_itself(tmp_path: Path):
 def test_an_object_without_a_watertight_stops_or_is_left_out_as_the_configuration_says(tmp_path, monkeypatch):
     path = small_config(tmp_path)
     config = load_config(path)
+    stopping = replace(config, selection=replace(config.selection, unusable="stop"))
 
     def no_watertight(self, uid):
         raise ObjectError(uid, "encloses no volume", expected="some thickness", action="Give it one.")
 
-    library = "datagen.objects.stores.library.MeshFolder.load"
+    library = "datagen.objects.stores.folder.MeshFolder.load"
     monkeypatch.setattr(library, no_watertight)
     with pytest.raises(ObjectError, match="encloses no volume"):
-        load_object(config, line("folder/can.ply"))
-    path.write_text(path.read_text().replace("unusable: stop", "unusable: remove"))
+        load_object(stopping, line("folder/can"))
     with pytest.raises(UnusableObjectError, match="encloses no volume"):
-        load_object(load_config(path), line("folder/can.ply"))
+        load_object(config, line("folder/can"))
     (tmp_path / "meshes" / "can.ply").unlink()  # a file that is missing here is never "left out"
     with pytest.raises(ObjectError) as error:
-        load_object(load_config(path), line("folder/can.ply"))
+        load_object(config, line("folder/can"))
     assert not isinstance(error.value, UnusableObjectError)

@@ -148,8 +148,11 @@ def flat_mesh(path: Path) -> None:
         ("flat.ply", flat_mesh),
     ],
 )
-def test_a_bad_object_is_one_line_before_anything_is_rendered(name, write, tmp_path):
+def test_where_asked_to_a_bad_object_stops_in_one_line_before_anything_is_rendered(name, write, tmp_path):
     config = small_config(tmp_path)
+    settings = yaml.safe_load(config.read_text())
+    settings["selection"]["unusable"] = "stop"
+    config.write_text(yaml.safe_dump(settings))
     write(tmp_path / "meshes" / name)
     out = tmp_path / "out"
     run = subprocess.run(render_command(config, out), cwd=ROOT, capture_output=True, text=True)
@@ -161,15 +164,14 @@ def test_a_bad_object_is_one_line_before_anything_is_rendered(name, write, tmp_p
     assert not (out / "plan.parquet").exists()
 
 
-def test_a_large_store_goes_on_without_its_bad_objects_and_says_so(tmp_path):
+def test_the_plan_goes_on_without_bad_objects_and_names_them(tmp_path):
     config = small_config(tmp_path)
     (tmp_path / "meshes" / "empty.ply").write_bytes(b"")
-    settings = yaml.safe_load(config.read_text())
-    settings["selection"]["unusable"] = "remove"
-    config.write_text(yaml.safe_dump(settings))
     result = CliRunner().invoke(main, ["plan", "--config", str(config), "--out", str(tmp_path / "out")])
     assert result.exit_code == 0, result.output
     assert "selection: 2 of 3 motions kept; removed: 1 object cannot be used" in result.output
+    assert "cannot be used: folder/empty: " in result.output
+    assert "is empty (0 bytes)" in result.output
 
 
 @pytest.mark.slow

@@ -16,7 +16,8 @@ from click.testing import CliRunner
 from datagen.cli.main import main
 from datagen.config import load_config
 from datagen.input_error import InputError
-from datagen.jobs.select_motions import SELECTION_FILE, Selection, select_motions
+from datagen.jobs.select_motions import Selection, select_motions
+from datagen.plan.plan import SELECTION_FILE
 from datagen.plan.selection_rules import Rule, removed_by_rule
 from shards.settings import SettingsError
 from tests.datagen.grasps.recorded.graspxl_sample import SAMPLE, needs_sample

@@ -1,6 +1,7 @@
 """Inputs as people have them: cut, turned, huge, grey, transparent, a single image."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -91,3 +92,22 @@ def test_grey_and_transparent_images(runs, tmp_path):
     changes = " ".join(record["input"]["changes"])
     assert "grey copied to three channels (1 of 3 frames)" in changes
     assert "transparency laid over black (1 of 3 frames)" in changes
+
+
+def test_names_that_no_terminal_can_show(runs, tmp_path):
+    """Brackets are markup to the library that prints, bytes that are no UTF-8 cannot be encoded."""
+    folder = tmp_path / "a[/b]"
+    folder.mkdir(parents=True)
+    name = os.fsdecode(b"[red]\xff.png")
+    try:
+        Image.fromarray(numbered_frame(5)).save(folder / name)
+    except OSError:
+        pytest.skip("no such name on this disk")
+    (folder / "[blue].txt").write_text("x")
+    out = tmp_path / "out"
+    arguments = ("--out", out, "--stage-one", runs.one, "--stages", "one")
+    status, output = forehoi("reconstruct", folder, *arguments)
+    assert status == 0, output
+    assert "a[/b]" in output
+    assert "note: files that are no images were not read: 1 .txt" in output
+    assert json.loads((out / RECORD).read_text())["frames"][0]["name"] == "[red]\\udcff.png"

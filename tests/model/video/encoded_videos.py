@@ -2,11 +2,14 @@
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
 
 import av
 import numpy as np
+from av.stream import Disposition
 from av.video.reformatter import ColorRange, Colorspace
+from PIL import Image
 
 from model.video.frames import VideoFrames
 
@@ -44,6 +47,71 @@ def corner_is_red(image: np.ndarray) -> bool:
     return bool(patch[0] > 150 and patch[1] < 90 and patch[2] < 90)
 
 
+def stored_for(scene: np.ndarray, orientation: int) -> np.ndarray:
+    """The pixels that a camera stores with this EXIF orientation, so that the scene is shown."""
+    stored = {
+        1: scene,
+        2: scene[:, ::-1],
+        3: np.rot90(scene, 2),
+        4: scene[::-1],
+        5: scene.swapaxes(0, 1),
+        6: np.rot90(scene, 1),
+        7: scene[::-1, ::-1].swapaxes(0, 1),
+        8: np.rot90(scene, -1),
+    }[orientation]
+    return np.ascontiguousarray(stored)
+
+
+def exif(orientation: int | None) -> Image.Exif:
+    data = Image.Exif()
+    data[0x010F] = "camera"
+    if orientation is not None:
+        data[0x0112] = orientation
+    return data
+
+
+def jpeg(pixels: np.ndarray, orientation: int | None) -> bytes:
+    """A JPEG with EXIF data."""
+    out = BytesIO()
+    Image.fromarray(pixels).save(out, "JPEG", exif=exif(orientation), quality=95)
+    return out.getvalue()
+
+
+def write_packets(
+    path: Path,
+    streams: Sequence[tuple[str, tuple[int, int], Sequence[bytes]]],
+    *,
+    turn_deg: int | None = None,
+    default: int | None = None,
+    cover: int | None = None,
+) -> Path:
+    """Encoded images as they are into streams of (codec, (width, height), images), 25 a second.
+
+    `default`: the stream that players take; `cover`: the one that is a cover image.
+    """
+    with av.open(str(path), "w") as container:
+        for i, (codec, (width, height), _) in enumerate(streams):
+            stream = container.add_stream(codec, rate=25)
+            assert isinstance(stream, av.VideoStream)
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuvj420p"
+            if turn_deg is not None:
+                stream.set_display_rotation(turn_deg)
+            if i == cover:
+                stream.disposition = Disposition.attached_pic
+            elif default is not None:
+                stream.disposition = Disposition.default if i == default else Disposition(0)
+            stream.time_base = Fraction(1, 25)
+        container.start_encoding()
+        for stream, (_, _, images) in zip(container.streams.video, streams, strict=True):
+            for number, data in enumerate(images):
+                packet = av.Packet(data)
+                packet.stream, packet.time_base = stream, Fraction(1, 25)
+                packet.pts = packet.dts = number
+                packet.is_keyframe = True
+                container.mux(packet)
+    return path
+
+
 def write_video(
     path: Path,
     frames: Iterable[np.ndarray],
@@ -57,6 +125,7 @@ def write_video(
     pixel_ratio: Fraction | None = None,
     times: Sequence[int] | None = None,
     hdr_transfer: int | None = None,
+    interlaced: bool = False,
     options: dict[str, str] | None = None,
     container_format: str | None = None,
     container_options: dict[str, str] | None = None,
@@ -87,11 +156,24 @@ def write_video(
                 frame = frame.reformat(
                     format=pix_fmt, dst_colorspace=Colorspace.BT2020, dst_color_range=ColorRange.MPEG
                 )
+            if interlaced:
+                frame = _top_field_first(frame.reformat(format=pix_fmt))
             frame.pts = number if times is None else times[number]
             frame.time_base = Fraction(1, fps)
             container.mux(stream.encode(frame))
         container.mux(stream.encode())
     return path
+
+
+def _top_field_first(frame: av.VideoFrame) -> av.VideoFrame:
+    """Only says so; the rows must be woven."""
+    graph = av.filter.Graph()
+    source = graph.add_buffer(
+        width=frame.width, height=frame.height, format=frame.format, time_base=Fraction(1, 25)
+    )
+    graph.link_nodes(source, graph.add("setfield", mode="tff"), graph.add("buffersink")).configure()
+    graph.vpush(frame)
+    return graph.vpull()
 
 
 def numbered_video(path: Path, n: int, *, size: tuple[int, int] = (160, 96), **settings: object) -> Path:

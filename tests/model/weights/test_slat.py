@@ -19,7 +19,8 @@ from model.structured_latent.vae.decoder import SurfaceDecoder
 from model.structured_latent.vae.latent import LatentNormalisation, SlatVaeConfig
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.tensor_files.safetensors_file import shapes_of
-from model.weights.published import ImportReport, find_published, import_networks, published_shapes
+from model.weights.importing import ImportReport, import_networks
+from model.weights.published import published_shapes
 from model.weights.slat import (
     SLAT_ENCODER,
     SLAT_FLOW,
@@ -28,6 +29,7 @@ from model.weights.slat import (
     slat_networks,
     trellis_normalisation,
 )
+from model.weights.source import find_published
 from model.weights.weight_file import load_weights
 from tests.model.networks.adapters import trainable_parameters
 from tests.model.networks.sparse.dense import from_dense
@@ -181,7 +183,9 @@ def test_the_normalisation_of_the_folder_counts(tmp_path: Path) -> None:
     run(tmp_path, tmp_path / "out.safetensors")
     assert load_file(tmp_path / "out.safetensors")["stage_two.normalisation.mean"].tolist() == values["mean"]
     (tmp_path / "out.safetensors").unlink()
-    for broken in ("{", "{}", '{"args": {"slat_normalization": {"mean": ["a"], "std": [1]}}}'):
+    (tmp_path / "pipeline.json").write_text("{")
+    fails(tmp_path, tmp_path / "out.safetensors", "pipeline.json: cannot be read")
+    for broken in ("{}", '{"args": 3}', '{"args": {"slat_normalization": {"mean": ["a"], "std": [1]}}}'):
         (tmp_path / "pipeline.json").write_text(broken)
         fails(tmp_path, tmp_path / "out.safetensors", "pipeline.json", "slat_normalization cannot be read")
 
@@ -194,7 +198,7 @@ def test_a_key_too_few_too_many_or_of_another_shape_is_refused_and_listed(tmp_pa
     fails(
         tmp_path,
         tmp_path / "out.safetensors",
-        "1 keys missing, 1 unused, 1 of another shape",
+        "1 missing (input_layer.bias), 1 unused (extra), 1 of another shape",
         "out_layer.bias (53,) in the file, (101,) in the module",
         "out.keys.json",
     )
@@ -227,6 +231,7 @@ def test_single_files_by_name_or_by_the_json_beside_them(tmp_path: Path) -> None
     found = find_published(tmp_path / "mine.safetensors", networks).found
     assert found == {ENCODER: tmp_path / "mine.safetensors"}
     (tmp_path / "mine.json").unlink()
+    save_file({"x": torch.zeros(1)}, tmp_path / "mine.safetensors")
     fails(
         tmp_path / "mine.safetensors",
         tmp_path / "b.safetensors",
@@ -242,7 +247,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         tmp_path,
         out,
         "holds none of the published networks among 0",
-        "Download from TRELLIS-image-large/ckpts",
+        "Download from microsoft/TRELLIS-image-large/ckpts",
     )
     write_published(tmp_path)
     (tmp_path / f"{FLOW}_fp16.json").write_text('{"name": "SparseStructureFlowModel", "args": {}}')

@@ -10,7 +10,7 @@ from torch.nn import functional
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.networks.lora import LoraSettings, add_lora
 from model.sparse_structure.stage_one import StageOne
-from model.weights.published import import_networks
+from model.weights.importing import import_networks
 from model.weights.trellis import stage_one_networks
 from model.weights.weight_file import load_start
 from tests.model.weights.published import SMALL_VAE, flow_config, write_published

@@ -115,7 +115,7 @@ def test_description_and_texture_agree_with_the_loaded_object(opened, root, stor
         assert described.licence == asset.licence
         assert described.appearance == asset.appearance
         assert (described.annotation is None) == (library.describe(uid).licences == ("CC-BY-NC-4.0",))
-        assert library.texture_quality(uid) == asset.texture
+        assert library.measure(uid).texture == asset.texture
 
 
 def test_mirrored_textured_object_keeps_its_registration_consistent(opened, root, store_root):
@@ -171,7 +171,7 @@ def test_textures_required(opened, root, tmp_path):
     assert library.uids() == opened(root).uids()
     assert library.load(f"objaverse/{BREAD}@large").registration is not None
     absent = f"objaverse/{objaverse_id('starter/rock_a')}@large"
-    for ask in (library.describe, library.texture_quality, library.load):
+    for ask in (library.describe, library.measure, library.load):
         with pytest.raises(ObjectError, match="has no object"):
             ask(absent)
     other = write_objaverse_store(tmp_path / "other", ("starter/milk",))
@@ -185,7 +185,7 @@ def test_required_model_that_is_not_downloaded_is_named(opened, root, tmp_path):
     part = glb.rename(glb.with_name(f"{BREAD}.glb.tmp"))
     for problem in ("is only partly downloaded", "has no object .*: it is not downloaded"):
         library = opened(root, store, "required")
-        for ask in (library.describe, library.texture_quality, library.load):
+        for ask in (library.describe, library.measure, library.load):
             with pytest.raises(ObjectError, match=problem):
                 ask(f"objaverse/{BREAD}@large")
         part.unlink(missing_ok=True)

@@ -10,9 +10,8 @@ import trimesh
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.mesh.graspable_size import HOLDABLE_SIDES_M, holdable_scale
-from datagen.objects.stores.library import REFERENCE_READING, MeshFolder, StarterPack, Sweethome3D
+from datagen.objects.stores.library import StarterPack, Sweethome3D
 
-GRASPXL = Path("/work/shared/graspxl_sample/object_dataset/large")
 DATA = files("datagen.objects").joinpath("data")
 
 
@@ -89,7 +88,7 @@ def test_textures_are_kept(assets):
 def test_description_and_texture_agree_with_the_loaded_object(pack, assets):
     for asset in assets[:5]:
         assert pack.describe(asset.uid).licence == asset.licence
-        assert pack.texture_quality(asset.uid) == asset.texture
+        assert pack.measure(asset.uid).texture == asset.texture
     with pytest.raises(ObjectError, match="has no object"):
         pack.describe("starter/moon")
 
@@ -111,77 +110,6 @@ def test_unknown_uid_is_named(pack):
 )
 def test_miniature_rule(size_m, scale):
     assert holdable_scale(np.array(size_m)) == pytest.approx(scale)
-
-
-def test_folder_loads_notes_and_caches(tmp_path, quick_preparation):
-    folder, cache = tmp_path / "meshes", tmp_path / "cache"
-    (folder / "deep").mkdir(parents=True)
-    trimesh.creation.box((10, 8, 6)).export(folder / "deep" / "box.stl")
-    (folder / "objects.csv").write_text(
-        "path,name,licence,author,url\ndeep/box.stl,Box,CC0-1.0,Ann,http://x\n"
-    )
-    library = MeshFolder(folder, REFERENCE_READING, quick_preparation, cache)
-    assert library.uids() == ("folder/deep/box.stl",)
-    first = library.load("folder/deep/box.stl")
-    assert (first.name, first.licence, first.author) == ("Box", "CC0-1.0", "Ann")
-    assert library.describe("folder/deep/box.stl").licence == "CC0-1.0"
-    assert library.texture_quality("folder/deep/box.stl") == first.texture
-    np.testing.assert_allclose(np.ptp(first.mesh.verts_obj, axis=0), [0.10, 0.06, 0.08])
-    again = library.load("folder/deep/box.stl")
-    np.testing.assert_array_equal(first.watertight.verts_obj, again.watertight.verts_obj)
-    assert len(list(cache.iterdir())) == 1
-
-
-@pytest.fixture
-def noted_folder(tmp_path, quick_preparation):
-    """A folder with a.stl and b.stl, opened with the licence of b.stl."""
-
-    def make(licence: str) -> MeshFolder:
-        for name in ("a", "b"):
-            trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / f"{name}.stl")
-        (tmp_path / "objects.csv").write_text(f"path,licence\na.stl,mit\nb.stl,{licence}\n")
-        return MeshFolder(tmp_path, REFERENCE_READING, quick_preparation, tmp_path / "cache")
-
-    return make
-
-
-@pytest.mark.parametrize(
-    ("written", "spdx"),
-    [
-        ("cc0", "CC0-1.0"),
-        (" cc-by-4.0 ", "CC-BY-4.0"),
-        ("LicenseRef-Ours", "LicenseRef-Ours"),
-        ("by AND mit", "CC-BY-4.0 AND MIT"),
-        ("", "NOASSERTION"),
-        ("  ", "NOASSERTION"),
-    ],
-)
-def test_folder_licences_become_spdx_ids(noted_folder, written, spdx):
-    assert noted_folder(written).describe("folder/b.stl").licence == spdx
-
-
-def test_folder_licence_with_a_typo_is_named(noted_folder):
-    problem = r"objects\.csv: row 3 \(b\.stl\): the licence 'cc00' is not known.*mean 'cc0'"
-    with pytest.raises(ObjectError, match=problem):
-        noted_folder("cc00")
-
-
-def test_empty_folder_is_refused(tmp_path, quick_preparation):
-    with pytest.raises(ObjectError, match="holds no meshes"):
-        MeshFolder(tmp_path, REFERENCE_READING, quick_preparation, tmp_path)
-    with pytest.raises(ObjectError, match="is not a folder"):
-        MeshFolder(tmp_path / "none", REFERENCE_READING, quick_preparation, tmp_path)
-
-
-@pytest.mark.skipif(not GRASPXL.is_dir(), reason="the GraspXL sample is not here")
-def test_graspxl_meshes_load_as_a_folder(tmp_path, quick_preparation):
-    library = MeshFolder(GRASPXL, REFERENCE_READING, quick_preparation, tmp_path)
-    assert len(library.uids()) == 20
-    for uid in library.uids()[::5]:
-        asset = library.load(uid)
-        watertight = trimesh.Trimesh(asset.watertight.verts_obj, asset.watertight.faces, process=False)
-        assert watertight.is_watertight
-        assert 0.06 < np.ptp(asset.mesh.verts_obj, axis=0).min() < 0.09
 
 
 def test_absent_debian_library_says_how_to_get_it(tmp_path, quick_preparation):
@@ -212,6 +140,6 @@ def test_debian_library_reads_catalogue_models(tmp_path, quick_preparation):
     asset = library.load(library.uids()[0])
     assert (asset.licence, asset.author) == ("CC0-1.0", "Anné")
     assert library.describe(asset.uid).licence == asset.licence
-    assert library.texture_quality(asset.uid) == asset.texture
+    assert library.measure(asset.uid).texture == asset.texture
     assert asset.catalogue_scale == pytest.approx(0.7)  # the middle side, 20 cm, is the limit
     np.testing.assert_allclose(np.ptp(asset.mesh.verts_obj, axis=0), [0.07, 0.14, 0.21], rtol=1e-6)

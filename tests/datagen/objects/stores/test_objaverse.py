@@ -201,7 +201,7 @@ def test_description_and_texture_agree_with_the_loaded_object(opened, root):
     asset = store.load(uid)
     assert store.describe(uid).licence == asset.licence
     assert store.describe(uid).annotation == store.annotation(uid)
-    assert store.texture_quality(uid) == asset.texture
+    assert store.measure(uid).texture == asset.texture
     with pytest.raises(ObjectError, match="has no object"):
         store.describe("objaverse/none")
 

@@ -5,6 +5,7 @@ import os
 import tracemalloc
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -12,8 +13,8 @@ import numpy as np
 import pytest
 
 from model.errors import ModelError
-from model.video.frame_converter import upright
 from model.video.frames import ReadLimits
+from model.video.orientation import upright
 from model.video.reading import read_frames, read_informative_frames
 from tests.model.video.encoded_videos import (
     corner_is_red,
@@ -50,10 +51,15 @@ def one_line(error: pytest.ExceptionInfo[ModelError], *parts: str) -> None:
         ("a.avi", "mpeg4", "yuv420p"),
         ("a.mkv", "ffv1", "gray"),
         ("a.gif", "gif", "rgb8"),
+        ("burst.heics", "libx265", "yuv420p"),
     ],
 )
 def test_every_frame_of_common_formats(tmp_path: Path, name: str, codec: str, pix_fmt: str) -> None:
-    path = numbered_video(tmp_path / name, 20, codec=codec, pix_fmt=pix_fmt, fps=25)
+    # A HEIC sequence is an mp4 of another brand.
+    settings: dict[str, Any] = {}
+    if name.endswith(".heics"):
+        settings = {"container_format": "mp4", "container_options": {"brand": "hevc"}}
+    path = numbered_video(tmp_path / name, 20, codec=codec, pix_fmt=pix_fmt, fps=25, **settings)
     frames = read_frames(path, ALL)
     assert numbers(frames) == list(range(20))
     assert frames.indices.tolist() == list(range(20))
@@ -111,7 +117,7 @@ def test_display_matrix_moves_every_pixel_as_its_definition_says() -> None:
         (-1, 0, 0, 1),
         (0, 1, 1, 0),
     ):
-        matrix = np.array([[a, b, 0], [c, d, 0], [0, 0, 1]]) * 65536
+        matrix = np.array([[a, b], [c, d]]) * 65536
         shown = upright(image, matrix)
         x, y = np.meshgrid(np.arange(5) + 0.5, np.arange(3) + 0.5)
         new_x, new_y = a * x + c * y, b * x + d * y
@@ -353,6 +359,13 @@ def test_missing_file_suggests_its_neighbour(tmp_path: Path) -> None:
     with pytest.raises(ModelError) as error:
         read_frames(tmp_path / "clip_mugg.mp4", ALL)
     one_line(error, "no such file", "Did you mean", "clip_mug.mp4")
+
+
+def test_a_pipe_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "clip.mp4")
+    with pytest.raises(ModelError) as error:
+        read_frames(tmp_path / "clip.mp4", ALL)
+    one_line(error, "neither a file nor a folder", "Check the path.")
 
 
 @pytest.mark.parametrize("changes", [{"max_frames": 0}, {"max_side_px": 0}])

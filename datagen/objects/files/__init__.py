@@ -1,0 +1,1 @@
+"""Files that users hand in: their text, and the files that they name."""

@@ -1,0 +1,1 @@
+"""Wavefront OBJ and MTL, as they are written and not only as they are specified."""

@@ -1,0 +1,1 @@
+"""Videos through FFmpeg (PyAV): the only place that reads with it."""
