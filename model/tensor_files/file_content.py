@@ -119,7 +119,10 @@ def mistaken_for(path: Path) -> Mistaken | None:
 
 
 def _short_text(content: bytes) -> Mistaken | None:
-    if not content.isascii() or not (text := content.decode("ascii").strip()).isprintable():
+    if not content.isascii():
+        return None
+    text = content.decode("ascii").strip()
+    if not text.isprintable():
         return None
     if _LINK.fullmatch(text):
         return Mistaken(

@@ -96,8 +96,11 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor], metadata: dict[str,
         save_file(saved, partial, metadata=metadata)
 
 
-def read_header(path: Path, *, expected: str, action: str) -> Header:
-    """Names, shapes and metadata. ModelError when the file is missing, torn, or holds anything but floats."""
+def read_header(path: Path, *, expected: str, action: str, ours: bool = False) -> Header:
+    """Names, shapes and metadata. ModelError when the file is missing, torn, or holds anything but floats.
+
+    `action` is what helps where nothing better is known; of a file of `ours`, always.
+    """
     check_file(path, expected=expected, action=action)
     try:
         with safe_open(str(path), framework="pt") as file:
@@ -108,7 +111,7 @@ def read_header(path: Path, *, expected: str, action: str) -> Header:
     except (OSError, SafetensorError) as error:
         mistaken = mistaken_for(path)
         reason = " ".join(str(error).split()) if mistaken is None else mistaken.what
-        action = action if mistaken is None else mistaken.action
+        action = action if mistaken is None or ours else mistaken.action
         raise ModelError(
             path, f"is no complete safetensors file ({reason})", expected=expected, action=action
         ) from error

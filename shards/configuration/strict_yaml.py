@@ -25,7 +25,9 @@ _SHOWN_CHARACTERS = 200
 class _Loader(yaml.SafeLoader):
     """Plain content and `!replace`; a key that stands twice is an error."""
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
+    def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Hashable, Any]:
+        if not isinstance(node, yaml.MappingNode):
+            raise yaml.constructor.ConstructorError(None, None, "expected a mapping node", node.start_mark)
         met: dict[object, yaml.Mark] = {}
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":
@@ -43,7 +45,7 @@ class _Loader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def replacement(self, node: yaml.Node) -> Replacement:
-        return Replacement(self.construct_mapping(node, deep=True))  # type: ignore[arg-type]  # refuses others itself
+        return Replacement(self.construct_mapping(node, deep=True))
 
 
 _Loader.add_constructor("!replace", _Loader.replacement)

@@ -104,7 +104,7 @@ class ViewFeatures:
 
     def _read(self, path: Path, chosen: str, *, voxels: int) -> Tensor:
         action = "Delete it: it is made again."
-        header = read_header(path, expected="features of an object", action=action)
+        header = read_header(path, expected="features of an object", action=action, ours=True)
         expected = (voxels, self.encoder.encoder.channels)
         if header.shapes.get(chosen) != expected:
             raise ModelError(path, f"holds {header.shapes}", expected=f"{chosen} {expected}", action=action)

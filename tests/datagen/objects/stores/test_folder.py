@@ -17,7 +17,7 @@ GRASPXL = Path("/work/shared/graspxl_sample/object_dataset/large")
 def test_folder_loads_notes_and_caches(tmp_path, quick_preparation):
     folder, cache = tmp_path / "meshes", tmp_path / "cache"
     (folder / "deep").mkdir(parents=True)
-    trimesh.creation.box((10, 8, 6)).export(folder / "deep" / "box.stl")
+    trimesh.creation.box((100, 80, 60)).export(folder / "deep" / "box.stl")
     (folder / "objects.csv").write_text(
         "path,name,licence,author,url\ndeep/box.stl,Box,CC0-1.0,Ann,http://x\n"
     )
