@@ -8,6 +8,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import yaml
 
@@ -23,7 +24,7 @@ from datagen.sources.objects import ObjectsConfig
 from datagen.version import generator_commit
 from shards.configuration.layers import read_layers
 from shards.configuration.strict_yaml import parse_yaml
-from shards.settings import settings_from_dict
+from shards.settings import Range, settings_from_dict
 from shards.splits import SplitRule
 from shards.storage.records import Provenance
 
@@ -51,7 +52,7 @@ class DatasetConfig:
     """
 
     name: str
-    seed: int
+    seed: Annotated[int, Range(0, 2**63 - 1)]
     objects: ObjectsConfig
     motions: MotionsConfig
     selection: SelectionConfig

@@ -8,12 +8,14 @@ here it is 0, which changes no prediction by more than 1e-5.
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from model.errors import ModelError
+from shards.settings import Range
 
 __all__ = [
     "Guidance",
@@ -106,8 +108,8 @@ class UniformTime:
 class LogitNormalTime:
     """t = sigmoid(z), z ~ N(mean, std^2); TRELLIS trains with mean 1, std 1 (FORMATS 4.4)."""
 
-    mean: float
-    std: float
+    mean: Annotated[float, Range(-100, 100)]
+    std: Annotated[float, Range(1e-6, 100)]
 
     def __post_init__(self) -> None:
         if not self.std > 0:
@@ -168,8 +170,8 @@ class SamplerSettings:
     25 steps with r = 3).
     """
 
-    steps: int
-    rescale_t: float
+    steps: Annotated[int, Range(1, 100_000)]
+    rescale_t: Annotated[float, Range(1e-3, 1e3)]
 
     def __post_init__(self) -> None:
         if self.steps < 1 or self.rescale_t <= 0:

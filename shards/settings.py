@@ -9,15 +9,38 @@ import types
 from collections.abc import Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-__all__ = ["Origins", "SettingsError", "did_you_mean", "settings_from_dict"]
+__all__ = ["Origins", "Range", "SettingsError", "did_you_mean", "settings_from_dict"]
 
 Settings = TypeVar("Settings")
 
 
 class SettingsError(ValueError):
     """A configuration does not fit its dataclass; one line: file, dotted key, expected, found."""
+
+
+@dataclass(frozen=True)
+class Range:
+    """Allowed values of a number, or of each of several, ends included: `Annotated[int, Range(1, 64)]`."""
+
+    low: int | float
+    high: int | float
+    rising: bool = False  # of a pair: (lowest, highest) of something
+
+    def problem(self, value: object) -> str | None:
+        """What would have been expected of a value of the right type; None where it is within."""
+        if isinstance(value, Mapping):
+            value = tuple(value.values())
+        numbers = value if isinstance(value, tuple) else () if value is None else (value,)
+        if any(not self.low <= number <= self.high for number in numbers):
+            each = "each " if isinstance(value, tuple) else ""
+            if self.high > 1e15:
+                return f"{each}at least {self.low:,}"
+            return f"{each}between {self.low:,} and {self.high:,}"
+        if self.rising and list(numbers) != sorted(numbers):
+            return "(lowest, highest)"
+        return None
 
 
 @dataclass(frozen=True)
@@ -44,8 +67,8 @@ def settings_from_dict(cls: type[Settings], data: object, where: str | Origins) 
     """An instance of the dataclass `cls` from `data`, the parsed content of the file `where`, or of several.
 
     Understands nested dataclasses, Literal, tuple[X, ...], tuple[X, Y], dict[str, X], X | None, Path,
-    str, bool, int, float (an int is accepted) and unions of dataclasses (the one whose keys fit).
-    Raises SettingsError.
+    str, bool, int, float (an int is accepted), unions of dataclasses (the one whose keys fit), and
+    numbers within a `Range`. Raises SettingsError.
     """
     return _dataclass_from(cls, data, Origins({"": (where,)}) if isinstance(where, str) else where, "")
 
@@ -53,7 +76,7 @@ def settings_from_dict(cls: type[Settings], data: object, where: str | Origins) 
 def _dataclass_from(cls: type[Settings], data: object, where: Origins, key: str) -> Settings:
     if not isinstance(data, Mapping):
         raise _mismatch(where, key, "a mapping", data)
-    hints = get_type_hints(cls)
+    hints = get_type_hints(cls, include_extras=True)
     known = {f.name: f for f in fields(cls) if f.init}  # type: ignore[arg-type]
     unknown = [name for name in data if name not in known]
     missing = [
@@ -81,6 +104,8 @@ def _value_from(hint: Any, value: object, where: Origins, key: str) -> Any:
     origin, arguments = get_origin(hint), get_args(hint)
     if hint is Any:
         return value
+    if origin is Annotated:
+        return _within(arguments, value, where, key)
     if is_dataclass(hint):
         return _dataclass_from(hint, value, where, key)  # type: ignore[arg-type]
     if origin in (Union, types.UnionType):
@@ -98,12 +123,23 @@ def _value_from(hint: Any, value: object, where: Origins, key: str) -> Any:
     return _scalar_from(hint, value, where, key)
 
 
+def _within(arguments: tuple[Any, ...], value: object, where: Origins, key: str) -> Any:
+    """A value of the annotated type that its ranges allow."""
+    converted = _value_from(arguments[0], value, where, key)
+    for allowed in arguments[1:]:
+        if isinstance(allowed, Range) and (expected := allowed.problem(converted)):
+            raise _mismatch(where, key, expected, value)
+    return converted
+
+
 def _scalar_from(hint: Any, value: object, where: Origins, key: str) -> Any:
     if hint is type(None) and value is None:
         return None
     if hint is Path and isinstance(value, str | Path):
         return Path(value)
     if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if not -1e300 < value < 1e300:  # NaN compares with nothing
+            raise _mismatch(where, key, "a finite number", value)
         return float(value)
     if hint in (str, bool, int) and type(value) is hint:
         return value

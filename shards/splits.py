@@ -2,9 +2,10 @@
 
 import hashlib
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from shards.errors import SplitError
+from shards.settings import Range
 
 __all__ = ["ObjectSplits", "Split", "SplitRule", "identity_and_variant", "object_identity", "split_of_object"]
 
@@ -15,8 +16,8 @@ Split = Literal["train", "val", "test"]
 class SplitRule:
     """Fractions of objects; what remains is for training."""
 
-    val_fraction: float
-    test_fraction: float
+    val_fraction: Annotated[float, Range(0, 1)]
+    test_fraction: Annotated[float, Range(0, 1)]
 
     def __post_init__(self) -> None:
         fractions = (self.val_fraction, self.test_fraction)

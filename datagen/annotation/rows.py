@@ -4,7 +4,7 @@ import hashlib
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from PIL import Image
@@ -18,6 +18,7 @@ from datagen.sampling.scene_sampling import SampledMotion
 from datagen.scene.scene import SLEEVE
 from shards.geometry import project_points, transform_points
 from shards.schema import ClipRow, FrameRow, ObjectRow
+from shards.settings import Range
 from shards.storage.images import decode_rgb, encode_geometry, encode_masks, encode_rgb_png
 
 __all__ = ["RenderRecord", "ShardConfig", "clip_id_of", "clip_row", "encoded_rgb", "frame_row", "object_row"]
@@ -32,7 +33,7 @@ class ShardConfig:
 
     depth_compression: Literal["pxr24", "zip"]
     rgb_codec: Literal["png", "jpeg", "webp"]  # png needs nothing to read; the others need Pillow
-    rgb_quality: int  # 1..100, jpeg and webp only
+    rgb_quality: Annotated[int, Range(1, 100)]  # 1..100, jpeg and webp only
 
 
 @dataclass(frozen=True, kw_only=True)

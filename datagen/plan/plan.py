@@ -8,6 +8,7 @@ machine, in any order, is the same.
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +16,7 @@ import pyarrow.parquet as pq
 
 from datagen.objects.asset.mirror import mirrored_uid
 from datagen.sampling.streams import Stream, stream_rng
+from shards.settings import Range
 from shards.splits import SplitRule, split_of_object
 from shards.storage.whole_file import write_whole
 
@@ -44,8 +46,8 @@ class PlanError(ValueError):
 class PlanConfig:
     """How many motions there are and how they fall into shards."""
 
-    motions: int
-    motions_per_shard: int
+    motions: Annotated[int, Range(1, 10_000_000)]
+    motions_per_shard: Annotated[int, Range(1, 100_000)]
 
 
 @dataclass(frozen=True, kw_only=True)

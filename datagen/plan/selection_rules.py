@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from importlib.resources import files
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from datagen.grasps.object_movement import measure_movement
 from datagen.grasps.recorded.graspxl import LICENCE, SequenceFile, read_sequence
@@ -26,6 +26,7 @@ from datagen.objects.mesh.mesh_measures import MeshMeasures
 from datagen.objects.mesh.texture_quality import TextureQuality
 from datagen.objects.stores.library import ObjectLibrary
 from datagen.plan.plan import Candidate
+from shards.settings import Range
 from shards.splits import object_identity
 
 __all__ = [
@@ -66,8 +67,8 @@ class Rule(Enum):
 class AnnotationRule:
     """Pre-filter by a store's own metrics, before a mesh is read; objects without annotation pass."""
 
-    min_textures: int
-    max_faces: int
+    min_textures: Annotated[int, Range(0, 1000)]
+    max_faces: Annotated[int, Range(1, 1_000_000_000)]
     allow_animated: bool
     allow_age_restricted: bool
 
@@ -76,17 +77,17 @@ class AnnotationRule:
 class TextureRule:
     """Texture quality, measured on the asset."""
 
-    min_resolution_px: int
-    min_color_detail: float  # 0..1
+    min_resolution_px: Annotated[int, Range(0, 65_536)]
+    min_color_detail: Annotated[float, Range(0, 1)]  # 0..1
 
 
 @dataclass(frozen=True, kw_only=True)
 class MovementRule:
     """Degree of object movement, measured on a recorded motion; simulated ones have grasp.min_movement_rad."""
 
-    min_rise_m: float
-    min_travel_m: float
-    min_rotation_rad: float
+    min_rise_m: Annotated[float, Range(0, 10)]
+    min_travel_m: Annotated[float, Range(0, 10)]
+    min_rotation_rad: Annotated[float, Range(0, 100)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,6 +2,7 @@
 
 import colorsys
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -14,6 +15,7 @@ from datagen.hands.skin import (
     sample_skin_coefficients,
 )
 from datagen.scene.scene import HandLook
+from shards.settings import Range
 from shards.storage.png import encode_png
 
 __all__ = ["AppearanceConfig", "sample_arm_style", "sample_betas", "sample_look"]
@@ -26,17 +28,19 @@ MAX_BETA = 2.0  # in standard deviations: beyond it shapes are caricatures
 class AppearanceConfig:
     """Looks of a hand. Pairs are (lowest, highest) of a uniform draw."""
 
-    n_betas: int
-    betas_std: float
-    skin_roughness: tuple[float, float]
-    subsurface: tuple[float, float]
-    bump: tuple[float, float]
-    nail_gloss: tuple[float, float]
-    forearm_length_m: tuple[float, float]  # at most what the grasps were simulated with
-    forearm_girth: tuple[float, float]
-    sleeve_probability: float
-    sleeve_start_m: tuple[float, float]  # from the wrist
-    sleeve_weave: tuple[float, float]
+    n_betas: Annotated[int, Range(0, 10)]
+    betas_std: Annotated[float, Range(0, 10)]
+    skin_roughness: Annotated[tuple[float, float], Range(0, 1, rising=True)]
+    subsurface: Annotated[tuple[float, float], Range(0, 1, rising=True)]
+    bump: Annotated[tuple[float, float], Range(0, 1, rising=True)]
+    nail_gloss: Annotated[tuple[float, float], Range(0, 1, rising=True)]
+    forearm_length_m: Annotated[
+        tuple[float, float], Range(0.05, 0.6, rising=True)
+    ]  # at most what the grasps were simulated with
+    forearm_girth: Annotated[tuple[float, float], Range(0.1, 10, rising=True)]
+    sleeve_probability: Annotated[float, Range(0, 1)]
+    sleeve_start_m: Annotated[tuple[float, float], Range(0, 1, rising=True)]  # from the wrist
+    sleeve_weave: Annotated[tuple[float, float], Range(0, 100, rising=True)]
 
 
 def sample_betas(rng: np.random.Generator, config: AppearanceConfig) -> Float[np.ndarray, " beta"]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from datagen.sampling.trajectories import MotionLimits, PathStyle, sample_view_p
 from datagen.sampling.visibility import VisibilityProbe
 from datagen.scene.scene import CameraPath
 from shards.geometry import camera_center
+from shards.settings import Range
 
 __all__ = ["CameraMetrics", "CamerasConfig", "PathStyles", "Surroundings", "sample_cameras"]
 
@@ -40,24 +41,30 @@ class PathStyles:
 class CamerasConfig:
     """Cameras of a motion. Lengths that are fractions refer to the image's shorter side."""
 
-    n_cameras: int
-    image_size: tuple[int, int]  # (width, height) in pixels
-    margin: float  # fraction kept free at every border
-    near_m: float  # no hand or object vertex nearer
-    slack: tuple[float, float]  # distance over the one that just frames the subject, >= 1
-    max_drift: float  # fraction; of the object's centre from its mean place
-    smoothing_s: float
+    n_cameras: Annotated[int, Range(1, 1000)]
+    image_size: Annotated[tuple[int, int], Range(16, 8192)]  # (width, height) in pixels
+    margin: Annotated[float, Range(0, 0.45)]  # fraction kept free at every border
+    near_m: Annotated[float, Range(0.001, 10)]  # no hand or object vertex nearer
+    slack: Annotated[
+        tuple[float, float], Range(1, 10, rising=True)
+    ]  # distance over the one that just frames the subject, >= 1
+    max_drift: Annotated[float, Range(0, 1)]  # fraction; of the object's centre from its mean place
+    smoothing_s: Annotated[float, Range(0, 60)]
     limits: MotionLimits
     styles: PathStyles
-    free_elevation_deg: tuple[float, float]  # without a table (egocentric keeps its own)
-    table_clearance_m: float  # cameras stay so far above the plane of the table
-    arm_clearance_m: float
-    min_visible: float  # visible fraction of the object, worst frame
-    min_visible_mean: float
-    min_object_size: float  # fraction; square root of the object's area, worst frame
-    attempts: int  # candidates per camera
-    arm_end_attempts: int  # so many of them may be refused for showing where the drawn arm ends
-    probe_rays: int  # rays across the image
+    free_elevation_deg: Annotated[
+        tuple[float, float], Range(-90, 90, rising=True)
+    ]  # without a table (egocentric keeps its own)
+    table_clearance_m: Annotated[float, Range(0, 10)]  # cameras stay so far above the plane of the table
+    arm_clearance_m: Annotated[float, Range(0, 10)]
+    min_visible: Annotated[float, Range(0, 1)]  # visible fraction of the object, worst frame
+    min_visible_mean: Annotated[float, Range(0, 1)]
+    min_object_size: Annotated[float, Range(0, 1)]  # fraction; square root of the object's area, worst frame
+    attempts: Annotated[int, Range(1, 100_000)]  # candidates per camera
+    arm_end_attempts: Annotated[
+        int, Range(0, 100_000)
+    ]  # so many of them may be refused for showing where the drawn arm ends
+    probe_rays: Annotated[int, Range(4, 4096)]  # rays across the image
 
     def __post_init__(self) -> None:
         if self.slack[0] < 1.0:

@@ -2,12 +2,14 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.grasps.sequence import GraspSequence
 from datagen.sampling.errors import SamplingError
+from shards.settings import Range
 
 __all__ = ["ClipConfig", "ClipWindow", "clip_windows", "object_movement"]
 
@@ -19,11 +21,17 @@ METRES_PER_RADIAN = 0.3  # travel that counts as much as one radian of turning
 class ClipConfig:
     """Length and rate of the clips of a motion."""
 
-    n_frames: int
-    fps: tuple[float, ...]  # one is drawn per motion, among those the motion is long enough for
-    pickup_probability: float  # of a clip that begins while the object still lies on a table
-    before_grasp_s: float  # how much of the approach may be seen then
-    preference: float  # 0: any part of the motion; larger: parts in which the object moves most
+    n_frames: Annotated[int, Range(1, 10_000)]
+    fps: Annotated[
+        tuple[float, ...], Range(0.1, 1000)
+    ]  # one is drawn per motion, among those the motion is long enough for
+    pickup_probability: Annotated[
+        float, Range(0, 1)
+    ]  # of a clip that begins while the object still lies on a table
+    before_grasp_s: Annotated[float, Range(0, 60)]  # how much of the approach may be seen then
+    preference: Annotated[
+        float, Range(0, 1000)
+    ]  # 0: any part of the motion; larger: parts in which the object moves most
 
 
 @dataclass(frozen=True, kw_only=True)

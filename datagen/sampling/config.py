@@ -1,13 +1,14 @@
 """SamplingConfig: the settings of a scene, assembled from those of its concerns."""
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 from datagen.sampling.appearance import AppearanceConfig
 from datagen.sampling.cameras import CamerasConfig
 from datagen.sampling.clip import ClipConfig
 from datagen.sampling.lights import LightsConfig
 from datagen.sampling.tables import TableConfig
+from shards.settings import Range
 
 __all__ = ["RenderConfig", "SamplingConfig"]
 
@@ -16,10 +17,12 @@ __all__ = ["RenderConfig", "SamplingConfig"]
 class RenderConfig:
     """Cycles settings that change pixels."""
 
-    samples: int
-    max_bounces: int
+    samples: Annotated[int, Range(1, 65_536)]
+    max_bounces: Annotated[int, Range(0, 1024)]
     denoise: bool
-    exposure_ev: tuple[float, float]  # (lowest, highest) of a uniform draw
+    exposure_ev: Annotated[
+        tuple[float, float], Range(-32, 32, rising=True)
+    ]  # (lowest, highest) of a uniform draw
     view_transform: Literal["AgX", "Filmic", "Standard"]
 
 

@@ -6,11 +6,13 @@ level s on average; a small lamp of P watts at distance d, facing it, gives P / 
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from datagen.scene.scene import AreaLight, Background
+from shards.settings import Range
 
 __all__ = ["LightsConfig", "blackbody_rgb", "lamp_power_w", "sample_light"]
 
@@ -22,16 +24,22 @@ SRGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415],
 class LightsConfig:
     """Light of a motion. Pairs are (lowest, highest) of a uniform draw."""
 
-    card_level: tuple[float, float]  # white card facing the key lamp, environment included
-    hdri_share: tuple[float, float]  # of that level; the key lamp has the rest
-    hdris: dict[str, float]  # name or path of an EXR -> factor on its share (a night stays dark)
-    n_lamps: tuple[int, int]  # 1..4: key, fill, rim and one more
-    fill_ratio: tuple[float, float]  # of the key's level
-    rim_ratio: tuple[float, float]
-    elevation_deg: tuple[float, float]
-    distance_m: tuple[float, float]
-    size_m: tuple[float, float]  # side of the square
-    temperature_k: tuple[float, float]
+    card_level: Annotated[
+        tuple[float, float], Range(0, 1000, rising=True)
+    ]  # white card facing the key lamp, environment included
+    hdri_share: Annotated[
+        tuple[float, float], Range(0, 1, rising=True)
+    ]  # of that level; the key lamp has the rest
+    hdris: Annotated[
+        dict[str, float], Range(0, 1000)
+    ]  # name or path of an EXR -> factor on its share (a night stays dark)
+    n_lamps: Annotated[tuple[int, int], Range(1, 4, rising=True)]  # 1..4: key, fill, rim and one more
+    fill_ratio: Annotated[tuple[float, float], Range(0, 100, rising=True)]  # of the key's level
+    rim_ratio: Annotated[tuple[float, float], Range(0, 100, rising=True)]
+    elevation_deg: Annotated[tuple[float, float], Range(-90, 90, rising=True)]
+    distance_m: Annotated[tuple[float, float], Range(0.001, 100, rising=True)]
+    size_m: Annotated[tuple[float, float], Range(0.001, 100, rising=True)]  # side of the square
+    temperature_k: Annotated[tuple[float, float], Range(800, 40_000, rising=True)]
 
     def __post_init__(self) -> None:
         if not 1 <= self.n_lamps[0] <= self.n_lamps[1] <= 4:

@@ -2,13 +2,14 @@
 
 import colorsys
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 
 from datagen.grasps.sequence import TableEdge
 from datagen.scene.scene import Table
+from shards.settings import Range
 
 __all__ = ["TableConfig", "sample_table"]
 
@@ -39,11 +40,15 @@ STONES: tuple[tuple[RGB, RGB], ...] = (
 class TableConfig:
     """The table of a motion. Pairs are (lowest, highest) of a uniform draw."""
 
-    probability: float  # where the motion works without one
-    size_m: tuple[float, float]  # of either side
-    thickness_m: tuple[float, float]
-    lowered_m: tuple[float, float]  # below the lowest point of a hand that holds the object in mid-air
-    materials: dict[str, float]  # wood, stone, cloth, laminate -> relative frequency
+    probability: Annotated[float, Range(0, 1)]  # where the motion works without one
+    size_m: Annotated[tuple[float, float], Range(0.05, 100, rising=True)]  # of either side
+    thickness_m: Annotated[tuple[float, float], Range(0.0001, 10, rising=True)]
+    lowered_m: Annotated[
+        tuple[float, float], Range(0, 10, rising=True)
+    ]  # below the lowest point of a hand that holds the object in mid-air
+    materials: Annotated[
+        dict[str, float], Range(0, 1e6)
+    ]  # wood, stone, cloth, laminate -> relative frequency
 
     def __post_init__(self) -> None:
         unknown = set(self.materials) - set(get_args(TableMaterial))

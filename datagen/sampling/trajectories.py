@@ -5,12 +5,14 @@ world Z, elevation above the horizon, both of the vector from the target to the 
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
 
 from datagen.sampling.errors import SamplingError
 from shards.geometry import look_at
+from shards.settings import Range
 
 __all__ = ["MotionLimits", "PathStyle", "ViewPath", "band_limited", "sample_view_path", "view_rotations"]
 
@@ -22,25 +24,33 @@ MAX_ELEVATION_RAD = np.radians(80.0)  # nearer to the vertical "up" would spin
 class PathStyle:
     """One kind of camera path. Pairs are (lowest, highest) of a uniform draw."""
 
-    weight: float  # relative frequency
-    fov_deg: tuple[float, float]  # horizontal
-    elevation_deg: tuple[float, float]
-    azimuth_sweep_deg: tuple[float, float]  # over the clip, either way round
-    elevation_sweep_deg: tuple[float, float]  # over the clip, up or down
-    zoom_out: tuple[float, float]  # last over first distance, or the reverse
-    floor_distance_m: tuple[float, float]  # never nearer to the target than this
-    roll_deg: float  # largest static roll
-    shake_deg: float  # largest tremble of direction and roll
-    shake_m: float  # largest tremble of the point looked at
+    weight: Annotated[float, Range(0, 1e6)]  # relative frequency
+    fov_deg: Annotated[tuple[float, float], Range(1, 170, rising=True)]  # horizontal
+    elevation_deg: Annotated[tuple[float, float], Range(-90, 90, rising=True)]
+    azimuth_sweep_deg: Annotated[
+        tuple[float, float], Range(0, 3600, rising=True)
+    ]  # over the clip, either way round
+    elevation_sweep_deg: Annotated[
+        tuple[float, float], Range(0, 180, rising=True)
+    ]  # over the clip, up or down
+    zoom_out: Annotated[
+        tuple[float, float], Range(1, 100, rising=True)
+    ]  # last over first distance, or the reverse
+    floor_distance_m: Annotated[
+        tuple[float, float], Range(0, 100, rising=True)
+    ]  # never nearer to the target than this
+    roll_deg: Annotated[float, Range(0, 180)]  # largest static roll
+    shake_deg: Annotated[float, Range(0, 180)]  # largest tremble of direction and roll
+    shake_m: Annotated[float, Range(0, 10)]  # largest tremble of the point looked at
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotionLimits:
     """What a camera's rotation may do, whatever its kind."""
 
-    angular_speed_deg_s: float
-    angular_acceleration_deg_s2: float
-    shake_band_hz: tuple[float, float]
+    angular_speed_deg_s: Annotated[float, Range(0.01, 1e5)]
+    angular_acceleration_deg_s2: Annotated[float, Range(0.01, 1e5)]
+    shake_band_hz: Annotated[tuple[float, float], Range(0.001, 1000, rising=True)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,13 +3,14 @@
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from datagen.hands.html_skin import find_html, load_html_skin
 from datagen.hands.mano import find_mano, load_mano
 from datagen.hands.model import HandModel, load_open_hand, mirror_hand
 from datagen.hands.skin import SkinBasis, load_open_skin
 from datagen.input_error import InputError
+from shards.settings import Range
 
 __all__ = ["HandConfig", "HandSource", "html_dir", "mano_dir", "open_hand", "resolved_hand"]
 
@@ -22,7 +23,9 @@ class HandConfig:
     mano_dir: Path | None  # folder of MANO_RIGHT.pkl; null: $MANO_DIR
     skin: Literal["open", "html", "auto"]
     html_dir: Path | None  # folder of TextureBasis; null: $HTML_DIR
-    left_probability: float  # of a motion with a left hand: the mirror image of a right one
+    left_probability: Annotated[
+        float, Range(0, 1)
+    ]  # of a motion with a left hand: the mirror image of a right one
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.left_probability <= 1.0:

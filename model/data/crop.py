@@ -7,6 +7,7 @@ a shift of the principal point, so `K` keeps square pixels and no skew. Mirrorin
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from model.data.batch import SurfaceTarget, TrainingSample
 from model.errors import ModelError
+from shards.settings import Range
 from shards.storage.images import MASK_BITS
 
 __all__ = [
@@ -39,10 +41,14 @@ _MASK_VALUE = 254
 class Augmentation:
     """How the square is drawn around hand and object, and how the image is varied."""
 
-    margin: tuple[float, float]  # side of the square over the longest side of the (turned) boxes, >= 1
-    shift: float  # 0: boxes in the centre; 1: anywhere inside the square
-    roll_deg: tuple[float, float]  # turn of the camera, clockwise in the image
-    flip_probability: float
+    margin: Annotated[
+        tuple[float, float], Range(1, 100, rising=True)
+    ]  # side of the square over the longest side of the (turned) boxes, >= 1
+    shift: Annotated[float, Range(0, 1)]  # 0: boxes in the centre; 1: anywhere inside the square
+    roll_deg: Annotated[
+        tuple[float, float], Range(-180, 180, rising=True)
+    ]  # turn of the camera, clockwise in the image
+    flip_probability: Annotated[float, Range(0, 1)]
 
     def __post_init__(self) -> None:
         checks = (

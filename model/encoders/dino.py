@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
 from jaxtyping import Float
@@ -12,6 +12,7 @@ from transformers import Dinov2WithRegistersConfig, Dinov2WithRegistersModel
 
 from model.encoders.token_grid import resized
 from model.errors import ModelError
+from shards.settings import Range
 
 __all__ = ["DinoConfig", "DinoEncoder", "load_dino"]
 
@@ -29,7 +30,7 @@ class DinoConfig:
     """`source`: folder written by `save_pretrained`, or hub id. `image_size`: pixels; the paper's is 518."""
 
     source: str | Path
-    image_size: int
+    image_size: Annotated[int, Range(8, 8192)]
     local_files_only: bool
     """True: never ask the hub, take what is on the disk."""
 

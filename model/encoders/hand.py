@@ -9,6 +9,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,6 +22,7 @@ from model.encoders.efficientnet import PYRAMID_CHANNELS, ImageNetPyramid
 from model.encoders.token_grid import cells_per_token, detailed_tokens, resized
 from model.errors import ModelError
 from model.tensor_files.safetensors_file import write_tensors
+from shards.settings import Range
 from shards.storage.whole_file import write_whole
 
 __all__ = [
@@ -48,9 +50,9 @@ class HandNetConfig:
     """`image_size`: pixels at which it runs, a multiple of 32. `stem`: channels at strides 2 and 4 of what it sees by
     itself, fine outlines; `decoder`: channels of its maps. All channels are multiples of 8."""
 
-    image_size: int
-    stem: tuple[int, int]
-    decoder: int
+    image_size: Annotated[int, Range(8, 8192)]
+    stem: Annotated[tuple[int, int], Range(1, 65_536)]
+    decoder: Annotated[int, Range(1, 65_536)]
 
     def __post_init__(self) -> None:
         if self.image_size < _COARSEST or self.image_size % _COARSEST:

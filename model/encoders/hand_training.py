@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -13,6 +14,7 @@ from model.data.batch import Batch
 from model.encoders.hand import HandNet, HandOutput
 from model.evaluation.overlap import intersection_over_union
 from model.training.task import Losses, Measurements
+from shards.settings import Range
 
 __all__ = ["METRICS", "HandLossConfig", "HandTask", "hand_losses", "joint_positions"]
 
@@ -31,12 +33,12 @@ _IMAGES = 8
 class HandLossConfig:
     """Mask loss + `object_weight` x object loss + `joint_weight` x joint loss + `side_weight` x side loss."""
 
-    object_weight: float
-    joint_weight: float
-    side_weight: float
-    sigma_cells: float
+    object_weight: Annotated[float, Range(0, 1e6)]
+    joint_weight: Annotated[float, Range(0, 1e6)]
+    side_weight: Annotated[float, Range(0, 1e6)]
+    sigma_cells: Annotated[float, Range(1e-3, 1e3)]
     """Standard deviation of a joint's target distribution, in stride-4 cells."""
-    color_jitter: float
+    color_jitter: Annotated[float, Range(0, 1)]
     """j: in training each channel is multiplied by e^u and raised to the power e^v, u and v uniform in
     [-j, j] for each sample; 0 for none. Skin is told from wood by more than its hue then."""
 

@@ -8,6 +8,7 @@ embedding is interpolated from 16 x 12 patches to 14 x 14, and the aggregator pr
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -17,6 +18,7 @@ from torch.nn import functional
 from model.encoders.checkpoint import load_state_dict
 from model.encoders.token_grid import CellCentres, resampled_tokens, resized
 from model.errors import ModelError
+from shards.settings import Range
 
 __all__ = [
     "WILOR_LAYOUT",
@@ -41,14 +43,14 @@ _ACTION = (
 class WilorLayout:
     """Sizes of the network. Image sizes are what its position embedding was made for, in pixels."""
 
-    image_height: int
-    image_width: int
-    patch: int
-    channels: int
-    depth: int
-    heads: int
-    mlp_ratio: int
-    joints: int
+    image_height: Annotated[int, Range(8, 8192)]
+    image_width: Annotated[int, Range(8, 8192)]
+    patch: Annotated[int, Range(1, 65_536)]
+    channels: Annotated[int, Range(1, 65_536)]
+    depth: Annotated[int, Range(1, 65_536)]
+    heads: Annotated[int, Range(1, 65_536)]
+    mlp_ratio: Annotated[int, Range(1, 65_536)]
+    joints: Annotated[int, Range(1, 65_536)]
     """Joints with a pose token: wrist and 15."""
 
     @property
@@ -169,8 +171,8 @@ class WilorConfig:
     """`image_size`: pixels (the paper's is 224); `grid`: tokens along a side, 14 for one a patch."""
 
     checkpoint: Path
-    image_size: int
-    grid: int
+    image_size: Annotated[int, Range(8, 8192)]
+    grid: Annotated[int, Range(1, 1024)]
     layout: WilorLayout = WILOR_LAYOUT
 
 

@@ -5,6 +5,7 @@ Adapters are written in peft's own format: `peft.PeftModel.from_pretrained(branc
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from peft import LoraConfig, get_peft_model_state_dict
 from peft.mapping import inject_adapter_in_model
@@ -13,6 +14,7 @@ from safetensors.torch import save_file
 from torch import nn
 
 from model.errors import ModelError
+from shards.settings import Range
 
 __all__ = [
     "ATTENTION_PROJECTIONS",
@@ -32,9 +34,9 @@ _WEIGHTS_FILE, _PEFT_PREFIX = "adapter_model.safetensors", "base_model.model."
 class LoraSettings:
     """W + alpha / rank B A. The paper: rank 64, alpha 128, dropout 0."""
 
-    rank: int
-    alpha: int
-    dropout: float = 0.0
+    rank: Annotated[int, Range(1, 65_536)]
+    alpha: Annotated[int, Range(1, 65_536)]
+    dropout: Annotated[float, Range(0, 1)] = 0.0
 
     def __post_init__(self) -> None:
         if self.rank < 1 or self.alpha <= 0 or not 0 <= self.dropout < 1:

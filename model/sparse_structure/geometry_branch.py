@@ -5,6 +5,7 @@ mlp 4, condition 1024) names and shapes of its parameters are those of ss_flow_i
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -20,6 +21,7 @@ from model.networks.transformer import (
     initialise_transformer,
     layer_norm,
 )
+from shards.settings import Range
 
 __all__ = ["GeometryBranch", "GeometryBranchConfig"]
 
@@ -32,14 +34,14 @@ class GeometryBranchConfig:
     false: the head gives the velocity itself, as in published weights.
     """
 
-    latent_resolution: int
-    latent_channels: int
-    patch: int
-    channels: int
-    condition_channels: int
-    blocks: int
-    heads: int
-    mlp_ratio: int
+    latent_resolution: Annotated[int, Range(1, 65_536)]
+    latent_channels: Annotated[int, Range(1, 65_536)]
+    patch: Annotated[int, Range(1, 65_536)]
+    channels: Annotated[int, Range(1, 65_536)]
+    condition_channels: Annotated[int, Range(1, 65_536)]
+    blocks: Annotated[int, Range(1, 65_536)]
+    heads: Annotated[int, Range(1, 65_536)]
+    mlp_ratio: Annotated[int, Range(1, 65_536)]
     preconditioned: bool
 
     def __post_init__(self) -> None:

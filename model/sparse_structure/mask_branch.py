@@ -5,6 +5,7 @@ view's place: permuting views permutes masks.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -20,6 +21,7 @@ from model.networks.transformer import (
     initialise_transformer,
     layer_norm,
 )
+from shards.settings import Range
 
 __all__ = ["MaskBranch", "MaskBranchConfig"]
 
@@ -28,13 +30,13 @@ __all__ = ["MaskBranch", "MaskBranchConfig"]
 class MaskBranchConfig:
     """Sizes: grid x grid tokens, each over patch x patch pixels of the mask; `blocks` is the paper's P."""
 
-    feature_channels: int
-    grid: int
-    patch: int
-    channels: int
-    blocks: int
-    heads: int
-    mlp_ratio: int
+    feature_channels: Annotated[int, Range(1, 65_536)]
+    grid: Annotated[int, Range(1, 65_536)]
+    patch: Annotated[int, Range(1, 65_536)]
+    channels: Annotated[int, Range(1, 65_536)]
+    blocks: Annotated[int, Range(1, 65_536)]
+    heads: Annotated[int, Range(1, 65_536)]
+    mlp_ratio: Annotated[int, Range(1, 65_536)]
 
     def __post_init__(self) -> None:
         require_heads("mask branch", self.channels, self.heads)

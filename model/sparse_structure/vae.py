@@ -16,6 +16,7 @@ a training step of `tiny` takes a fifth of the time of four levels from 64³ dow
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Bool, Float
@@ -30,6 +31,7 @@ from model.networks.convolution import (
     pixel_shuffle_3d,
     pixel_unshuffle_3d,
 )
+from shards.settings import Range
 
 __all__ = [
     "LatentDistribution",
@@ -51,11 +53,11 @@ class VaeConfig:
     `patch`: the finest level has a cell for each patch³ voxels.
     """
 
-    patch: int
-    channels: tuple[int, ...]
-    latent_channels: int
-    residual_blocks: tuple[int, ...]
-    middle_blocks: int
+    patch: Annotated[int, Range(1, 65_536)]
+    channels: Annotated[tuple[int, ...], Range(1, 65_536)]
+    latent_channels: Annotated[int, Range(1, 65_536)]
+    residual_blocks: Annotated[tuple[int, ...], Range(0, 1000)]
+    middle_blocks: Annotated[int, Range(0, 1000)]
 
     def __post_init__(self) -> None:
         if not self.channels or min(*self.channels, self.latent_channels, self.patch) < 1:

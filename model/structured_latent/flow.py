@@ -9,6 +9,7 @@ With the values of slat_flow_img_dit_L_64l8p2 (resolution 64, latent 8, channels
 
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -25,6 +26,7 @@ from model.networks.sparse.transformer import ModulatedSparseCrossBlock
 from model.networks.transformer import initialise_head, initialise_transformer, layer_norm, run_block
 from model.structured_latent.vae.latent import require_layout
 from model.structured_latent.vae.trunk import embedded
+from shards.settings import Range
 
 __all__ = ["SlatFlow", "SlatFlowConfig"]
 
@@ -38,16 +40,16 @@ class SlatFlowConfig:
     what `preconditioned_velocity` lacks, which small networks learn sooner; false for published weights.
     """
 
-    resolution: int
-    latent_channels: int
-    channels: int
-    condition_channels: int
-    blocks: int
-    heads: int
-    mlp_ratio: int
-    patch: int
-    io_channels: tuple[int, ...]
-    pool_pseudo_count: int
+    resolution: Annotated[int, Range(1, 65_536)]
+    latent_channels: Annotated[int, Range(1, 65_536)]
+    channels: Annotated[int, Range(1, 65_536)]
+    condition_channels: Annotated[int, Range(1, 65_536)]
+    blocks: Annotated[int, Range(1, 65_536)]
+    heads: Annotated[int, Range(1, 65_536)]
+    mlp_ratio: Annotated[int, Range(1, 65_536)]
+    patch: Annotated[int, Range(1, 65_536)]
+    io_channels: Annotated[tuple[int, ...], Range(1, 65_536)]
+    pool_pseudo_count: Annotated[int, Range(0, 1_000_000)]
     checkpoint_blocks: bool
     preconditioned: bool
 

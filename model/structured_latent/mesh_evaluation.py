@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from model.networks.sparse.tensor import SparseTensor
 from model.structured_latent.prediction import decoded_fields
 from model.surface.extraction import ExtractionConfig, extract_surface
 from model.surface.mesh import MeshReport, SurfaceMesh, check_manifold
+from shards.settings import Range
 
 __all__ = ["MESH_METRICS", "MeshEvaluationConfig", "ScoredMesh", "numbers_of_objects", "scored_mesh"]
 
@@ -34,7 +36,7 @@ class MeshEvaluationConfig:
     """How decoded objects are measured."""
 
     extraction: ExtractionConfig
-    samples: int  # points on the mesh
+    samples: Annotated[int, Range(1, 100_000_000)]  # points on the mesh
 
 
 @dataclass(frozen=True, kw_only=True)

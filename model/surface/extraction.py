@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64
@@ -12,6 +13,7 @@ from model.surface.cube_cases import EDGES, triangle_table
 from model.surface.fields import CORNERS, SurfaceFields
 from model.surface.lattice import CornerLattice, SignedLattice, corner_lattice, fill_uncovered
 from model.surface.mesh import SurfaceMesh
+from shards.settings import Range
 
 __all__ = ["ExtractedSurface", "ExtractionConfig", "extract_surface"]
 
@@ -23,7 +25,9 @@ _END_SHARE = 0.005
 class ExtractionConfig:
     """How a surface is taken from decoded voxels."""
 
-    seal: int  # corners; gaps of up to twice as many in the shell of active voxels are closed
+    seal: Annotated[
+        int, Range(0, 100)
+    ]  # corners; gaps of up to twice as many in the shell of active voxels are closed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,8 +2,10 @@
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 from model.training.precision import Precision
+from shards.settings import Range
 
 __all__ = ["OptimizerConfig", "TrainerConfig"]
 
@@ -12,12 +14,14 @@ __all__ = ["OptimizerConfig", "TrainerConfig"]
 class OptimizerConfig:
     """Adam as in the paper (section 4.1: 5e-4)."""
 
-    learning_rate: float
-    betas: tuple[float, float]
-    weight_decay: float
-    warmup_steps: int  # linear from 0
-    final_factor: float  # cosine to this share of the rate at the last step; 1: constant
-    clip_norm: float  # of the whole gradient
+    learning_rate: Annotated[float, Range(0, 1e3)]
+    betas: Annotated[tuple[float, float], Range(0, 1)]
+    weight_decay: Annotated[float, Range(0, 1e3)]
+    warmup_steps: Annotated[int, Range(0, 1_000_000_000)]  # linear from 0
+    final_factor: Annotated[
+        float, Range(0, 1)
+    ]  # cosine to this share of the rate at the last step; 1: constant
+    clip_norm: Annotated[float, Range(1e-9, 1e9)]  # of the whole gradient
 
     def rate(self, step: int, steps: int) -> float:
         """Learning rate of step `step`, 0 .. steps - 1."""
@@ -32,15 +36,15 @@ class OptimizerConfig:
 class TrainerConfig:
     """Length, precision and bookkeeping of a run."""
 
-    seed: int
-    steps: int
-    accumulate: int  # batches per optimiser step
+    seed: Annotated[int, Range(0, 2**63 - 1)]
+    steps: Annotated[int, Range(1, 1_000_000_000)]
+    accumulate: Annotated[int, Range(1, 1_000_000_000)]  # batches per optimiser step
     precision: Precision
-    ema_decay: float
-    checkpoint_every: int
-    keep_checkpoints: int
-    validate_every: int
-    log_every: int
+    ema_decay: Annotated[float, Range(0, 1)]
+    checkpoint_every: Annotated[int, Range(1, 1_000_000_000)]
+    keep_checkpoints: Annotated[int, Range(1, 1_000_000_000)]
+    validate_every: Annotated[int, Range(1, 1_000_000_000)]
+    log_every: Annotated[int, Range(1, 1_000_000_000)]
 
     def __post_init__(self) -> None:
         for name in (

@@ -15,6 +15,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor, nn
@@ -29,6 +30,7 @@ from model.tensor_files.safetensors_file import (
     shapes_of,
     write_tensors,
 )
+from shards.settings import Range
 
 __all__ = [
     "GEOMETRY",
@@ -51,7 +53,9 @@ class StartConfig:
     """Weights to start from instead of random ones."""
 
     weights: Path  # a file of ours
-    latent_scale: float  # by which the latents were divided that they were trained on; TRELLIS: 1
+    latent_scale: Annotated[
+        float, Range(1e-6, 1e6)
+    ]  # by which the latents were divided that they were trained on; TRELLIS: 1
 
     def __post_init__(self) -> None:
         if not self.latent_scale > 0:

@@ -6,6 +6,7 @@ sequence says so in `stands_in_for`, and its contacts are measured, not assumed.
 """
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 from jaxtyping import Float
@@ -21,6 +22,7 @@ from datagen.grasps.sequence import GraspQuality, GraspSequence
 from datagen.hands.model import PosedHand, ShapedHand, pose_hand
 from datagen.objects.asset.object_asset import ObjectAsset
 from shards.geometry import invert_transform
+from shards.settings import Range
 
 __all__ = ["RECORDED_HAND", "ReplayConfig", "ReplayError", "replay"]
 
@@ -39,11 +41,13 @@ class ReplayError(ValueError):
 class ReplayConfig:
     """How recorded motions are replayed."""
 
-    time_scale: float  # 1: as recorded; 2: the motion takes twice as long
-    carried_m: float  # the hand carries the object once it stays this close to its place in the hand ...
-    carried_rad: float  # ... and this close to its orientation
-    min_digits: int  # that touch the object at the end
-    max_penetration_m: float  # hand vertices into the object while it is carried
+    time_scale: Annotated[float, Range(0.01, 100)]  # 1: as recorded; 2: the motion takes twice as long
+    carried_m: Annotated[
+        float, Range(0, 1)
+    ]  # the hand carries the object once it stays this close to its place in the hand ...
+    carried_rad: Annotated[float, Range(0, 3.15)]  # ... and this close to its orientation
+    min_digits: Annotated[int, Range(0, 5)]  # that touch the object at the end
+    max_penetration_m: Annotated[float, Range(0, 1)]  # hand vertices into the object while it is carried
 
     def __post_init__(self) -> None:
         if not self.time_scale > 0.0:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -17,6 +17,7 @@ from datagen.objects.gltf.texture_images import permitted_image
 from datagen.objects.mesh.file_mesh import FileMesh, refuse_too_many_faces
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
 from datagen.objects.wavefront.obj_file import read_obj
+from shards.settings import Range
 
 __all__ = ["MESH_SUFFIXES", "ReadObject", "ReadingConfig", "object_mesh", "read_object"]
 
@@ -32,9 +33,11 @@ class ReadingConfig:
 
     unit: Literal["m", "cm", "mm", "auto"]  # of OBJ, PLY and STL; glTF is always metres
     up_axis: Literal["y", "z"]  # of OBJ, PLY and STL; glTF is always Y-up
-    max_faces: int  # more are refused
-    max_image_px: int  # longer image sides are refused
-    max_file_mb: float = MAX_FILE_MB  # 10^6 bytes; larger files are refused before they are read
+    max_faces: Annotated[int, Range(1, 1_000_000_000)]  # more are refused
+    max_image_px: Annotated[int, Range(1, 65_536)]  # longer image sides are refused
+    max_file_mb: Annotated[float, Range(0.001, 100_000)] = (
+        MAX_FILE_MB  # 10^6 bytes; larger files are refused before they are read
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

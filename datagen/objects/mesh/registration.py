@@ -7,6 +7,7 @@ box, then by the distances between the surfaces; the similarity is then refined 
 
 from dataclasses import dataclass
 from itertools import permutations, product
+from typing import Annotated
 
 import igl
 import numpy as np
@@ -15,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from datagen.objects.errors import ObjectError
 from datagen.objects.mesh.outward_faces import ray_intersector
 from datagen.objects.mesh.surface_points import face_areas, face_normals
+from shards.settings import Range
 
 __all__ = ["REFERENCE_REGISTRATION", "Registration", "RegistrationConfig", "axis_rotations", "register"]
 
@@ -30,11 +32,17 @@ ICP_KEPT_SHARE = 0.9  # farther pairs are caps over holes, or parts that the cop
 class RegistrationConfig:
     """How surfaces are compared and what is refused."""
 
-    n_points: int  # per surface
-    icp_steps: int
-    max_size_error: float  # of the bbox sides after one common scale / diagonal of the rescaled mesh
-    max_residual: float  # 95th percentile of the surface distance / diagonal of the rescaled mesh
-    equally_good: float  # mean distances up to this factor apart are a tie (symmetric objects)
+    n_points: Annotated[int, Range(10, 1_000_000)]  # per surface
+    icp_steps: Annotated[int, Range(0, 10_000)]
+    max_size_error: Annotated[
+        float, Range(0, 10)
+    ]  # of the bbox sides after one common scale / diagonal of the rescaled mesh
+    max_residual: Annotated[
+        float, Range(0, 10)
+    ]  # 95th percentile of the surface distance / diagonal of the rescaled mesh
+    equally_good: Annotated[
+        float, Range(1, 100)
+    ]  # mean distances up to this factor apart are a tie (symmetric objects)
 
 
 REFERENCE_REGISTRATION = RegistrationConfig(

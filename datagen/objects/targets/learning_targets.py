@@ -6,6 +6,7 @@ All targets describe the *watertight* mesh, with no hidden inner geometry.
 
 import hashlib
 from dataclasses import dataclass
+from typing import Annotated
 
 import igl
 import numpy as np
@@ -16,6 +17,7 @@ from datagen.objects.mesh.object_mesh import ObjectMesh
 from datagen.objects.mesh.surface_points import colors_at, sample_surface
 from datagen.objects.targets.occupancy import surface_voxels
 from datagen.objects.watertight.watertight_mesh import signed_distance
+from shards.settings import Range
 
 __all__ = ["LearningTargets", "TargetsConfig", "learning_targets"]
 
@@ -26,10 +28,12 @@ RESOLUTION = 64
 class TargetsConfig:
     """How many samples are stored per object."""
 
-    surface_points: int
-    sdf_near_points: int  # around the surface, normal offsets from N(0, sigma)
-    sdf_near_sigma: float  # canonical units (1 = longest side)
-    sdf_uniform_points: int  # in [-0.5, 0.5]^3
+    surface_points: Annotated[int, Range(1, 10_000_000)]
+    sdf_near_points: Annotated[
+        int, Range(1, 10_000_000)
+    ]  # around the surface, normal offsets from N(0, sigma)
+    sdf_near_sigma: Annotated[float, Range(0, 1)]  # canonical units (1 = longest side)
+    sdf_uniform_points: Annotated[int, Range(1, 10_000_000)]  # in [-0.5, 0.5]^3
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,7 @@
 """Convex parts for the physics: CoACD on a watertight mesh with fewer faces, cut finer until the hulls fit."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import coacd
 import numpy as np
@@ -14,6 +15,7 @@ from datagen.objects.watertight.watertight_mesh import (
     decimated_watertight,
     signed_distance,
 )
+from shards.settings import Range
 
 __all__ = ["ConvexConfig", "HullFit", "convex_parts", "hull_fit"]
 
@@ -26,14 +28,22 @@ MCTS_NODES, RESOLUTION = 10, 1000
 class ConvexConfig:
     """CoACD's parameters and when to cut finer."""
 
-    thresholds: tuple[float, ...]  # concavity, tried in turn until the excess is small enough
-    max_hulls: int
-    max_hull_verts: int
-    hull_tolerance_m: float  # a hull gets no more vertices once it is this close to its full form
-    max_excess_m: float  # hull surface outside the watertight mesh (99th percentile) that ends the search
-    max_faces: int  # the watertight mesh is lightened to about this many faces first
-    mcts_iterations: int  # CoACD's search effort per cut; its own default is 150
-    seed: int
+    thresholds: Annotated[
+        tuple[float, ...], Range(0.001, 1)
+    ]  # concavity, tried in turn until the excess is small enough
+    max_hulls: Annotated[int, Range(1, 10_000)]
+    max_hull_verts: Annotated[int, Range(4, 10_000)]
+    hull_tolerance_m: Annotated[
+        float, Range(0, 1)
+    ]  # a hull gets no more vertices once it is this close to its full form
+    max_excess_m: Annotated[
+        float, Range(0, 1)
+    ]  # hull surface outside the watertight mesh (99th percentile) that ends the search
+    max_faces: Annotated[
+        int, Range(100, 100_000_000)
+    ]  # the watertight mesh is lightened to about this many faces first
+    mcts_iterations: Annotated[int, Range(1, 10_000)]  # CoACD's search effort per cut; its own default is 150
+    seed: Annotated[int, Range(0, 2**31 - 1)]
 
 
 @dataclass(frozen=True, kw_only=True)

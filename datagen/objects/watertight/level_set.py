@@ -11,6 +11,7 @@ The field is `side * distance - offset`, sampled near the surface only.
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import igl
 import numpy as np
@@ -19,6 +20,7 @@ from scipy import ndimage
 
 from datagen.objects.mesh.outward_faces import ray_intersector
 from datagen.objects.mesh.surface_points import face_normals
+from shards.settings import Range
 
 __all__ = ["LevelSetConfig", "level_set_surface"]
 
@@ -31,10 +33,12 @@ BARRIER = 0.51  # in voxels: two neighbours on opposite sides cannot both be far
 class LevelSetConfig:
     """Resolution of the level set and what counts as closed."""
 
-    voxels_longest: int  # grid steps along the longest side
-    min_voxel_m: float
-    max_hole_m: float  # holes narrower than this are closed
-    sheet_voxels: float  # thickness of single sheets; at least 1.75 or the grid loses them
+    voxels_longest: Annotated[int, Range(16, 2048)]  # grid steps along the longest side
+    min_voxel_m: Annotated[float, Range(1e-6, 1)]
+    max_hole_m: Annotated[float, Range(0, 1)]  # holes narrower than this are closed
+    sheet_voxels: Annotated[
+        float, Range(1.75, 100)
+    ]  # thickness of single sheets; at least 1.75 or the grid loses them
 
     def voxel_m(self, verts: Float[np.ndarray, "vert 3"]) -> float:
         """Grid step for a mesh of this size."""

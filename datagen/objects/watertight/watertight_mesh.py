@@ -1,6 +1,7 @@
 """A closed surface for any mesh: its own where it is closed, else a fine level set."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import fast_simplification
 import igl
@@ -11,6 +12,7 @@ from manifold3d import Error, Manifold, Mesh64, OpType
 from datagen.objects.errors import ObjectError
 from datagen.objects.mesh.surface_points import face_areas, face_normals
 from datagen.objects.watertight.level_set import LevelSetConfig, level_set_surface
+from shards.settings import Range
 
 __all__ = [
     "WatertightConfig",
@@ -28,8 +30,10 @@ class WatertightConfig:
     """How closed surfaces are made."""
 
     level_set: LevelSetConfig
-    tolerance_m: float  # simplification moves the surface by less than this
-    max_faces: int  # quadric decimation beyond this, where the surface stays closed
+    tolerance_m: Annotated[float, Range(0, 1)]  # simplification moves the surface by less than this
+    max_faces: Annotated[
+        int, Range(100, 100_000_000)
+    ]  # quadric decimation beyond this, where the surface stays closed
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,9 +1,11 @@
 """What the sections of both flows have in common: guidance, and what cannot be trained."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from model.flow import Guidance
 from model.networks.lora import LoraSettings
+from shards.settings import Range
 
 __all__ = ["GuidanceConfig", "guidance_of", "require_adapter", "require_condition"]
 
@@ -12,8 +14,8 @@ __all__ = ["GuidanceConfig", "guidance_of", "require_adapter", "require_conditio
 class GuidanceConfig:
     """Classifier-free guidance, as `model.flow.Guidance` says."""
 
-    strength: float  # w: (1 + w) v_c - w v_u
-    interval: tuple[float, float]  # of t, inside [0, 1]
+    strength: Annotated[float, Range(0, 1e3)]  # w: (1 + w) v_c - w v_u
+    interval: Annotated[tuple[float, float], Range(0, 1, rising=True)]  # of t, inside [0, 1]
 
     def __post_init__(self) -> None:
         if self.strength == 0:

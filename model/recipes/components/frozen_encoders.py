@@ -1,6 +1,7 @@
 """The frozen encoders of images and hands that a configuration names, and the trained aggregator over them."""
 
 from dataclasses import dataclass
+from typing import Annotated
 
 from model.encoders.aggregator import AggregatorConfig, FeatureAggregator
 from model.encoders.cached import CachedEncoder
@@ -10,6 +11,7 @@ from model.encoders.hand import HandEncoder, packaged_hand_net, packaged_hand_sh
 from model.encoders.protocol import FeatureEncoder
 from model.encoders.wilor import WilorConfig, load_wilor
 from model.errors import ModelError
+from shards.settings import Range
 
 __all__ = [
     "EncodersConfig",
@@ -27,14 +29,14 @@ __all__ = [
 class OwnHandEncoder:
     """The hand encoder that this configuration trains, on a token grid of its own."""
 
-    own_grid: int
+    own_grid: Annotated[int, Range(1, 1024)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class PackagedHandEncoder:
     """The hand encoder that ships with the package, on a token grid of its own."""
 
-    packaged_grid: int
+    packaged_grid: Annotated[int, Range(1, 1024)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +45,9 @@ class EncodersConfig:
 
     image: EfficientNetConfig | DinoConfig
     hand: OwnHandEncoder | PackagedHandEncoder | WilorConfig
-    cached_views: int  # images whose features are kept; of use where crops repeat, 0: none
+    cached_views: Annotated[
+        int, Range(0, 1_000_000_000)
+    ]  # images whose features are kept; of use where crops repeat, 0: none
 
 
 def encoder_digests(encoders: EncodersConfig) -> tuple[str, ...]:

@@ -1,9 +1,11 @@
 """How a component is trained and measured on the shared data."""
 
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 from model.data.config import DataConfig, StreamConfig
 from model.training.config import OptimizerConfig, TrainerConfig
+from shards.settings import Range
 from shards.splits import Split
 
 __all__ = ["ImageRecipe", "Recipe", "ValidationConfig", "require_held_out"]
@@ -17,7 +19,7 @@ class Recipe:
 
     trainer: TrainerConfig
     optimizer: OptimizerConfig
-    batch_size: int  # over all ranks
+    batch_size: Annotated[int, Range(1, 1_000_000)]  # over all ranks
 
     def __post_init__(self) -> None:
         if self.batch_size < 1:
@@ -40,8 +42,8 @@ class Recipe:
 class ImageRecipe(Recipe):
     """How a component is trained that looks at images."""
 
-    views: tuple[int, int]  # fewest and most of a sample
-    image_size: int  # px
+    views: Annotated[tuple[int, int], Range(1, 1000, rising=True)]  # fewest and most of a sample
+    image_size: Annotated[int, Range(8, 8192)]  # px
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -65,10 +67,10 @@ class ValidationConfig:
     """
 
     split: Split
-    views: int
-    batch_size: int
-    samples_per_motion: int  # each with its own views
-    batches: int  # at most
+    views: Annotated[int, Range(1, 1000)]
+    batch_size: Annotated[int, Range(1, 100_000)]
+    samples_per_motion: Annotated[int, Range(1, 1_000_000)]  # each with its own views
+    batches: Annotated[int, Range(1, 1_000_000)]  # at most
 
     def __post_init__(self) -> None:
         if min(self.views, self.batch_size, self.samples_per_motion, self.batches) < 1:

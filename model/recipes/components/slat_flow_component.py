@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 
@@ -39,6 +39,7 @@ from model.structured_latent.vae_training import SlatVae
 from model.structured_latent.view_conditioned import ViewConditionedSlatFlow
 from model.weights.slat import STAGE_TWO, load_stage_two_start
 from model.weights.weight_file import weights_sha256
+from shards.settings import Range
 
 __all__ = ["SlatFlowComponent", "TrainedSlatFlow"]
 
@@ -54,9 +55,9 @@ class TrainedSlatFlow:
     network: SlatFlowConfig
     start: Path | None
     lora: LoraSettings | None
-    hand_width: int  # of the aggregator (section 3.1)
-    hidden: int
-    drop_condition: float
+    hand_width: Annotated[int, Range(1, 65_536)]  # of the aggregator (section 3.1)
+    hidden: Annotated[int, Range(1, 65_536)]
+    drop_condition: Annotated[float, Range(0, 1)]
     time: UniformTime | LogitNormalTime
     sampler: SamplerSettings
     guidance: GuidanceConfig | None  # null for none

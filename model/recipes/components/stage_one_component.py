@@ -6,7 +6,7 @@ RUN/stage_one/dataset_statistics.safetensors    what it needs of the training da
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import torch
 from jaxtyping import Bool
@@ -44,6 +44,7 @@ from model.sparse_structure.dual_branch import DualBranchConfig, DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.weights.weight_file import StartConfig, load_start, weights_sha256
+from shards.settings import Range
 
 __all__ = ["StageOneComponent", "TrainedStageOne"]
 
@@ -59,10 +60,10 @@ class TrainedStageOne:
     network: DualBranchConfig
     start: StartConfig | None
     lora: LoraSettings | None
-    hand_width: int  # of the aggregator (section 3.1)
-    hidden: int
-    beta: float
-    drop_condition: float
+    hand_width: Annotated[int, Range(1, 65_536)]  # of the aggregator (section 3.1)
+    hidden: Annotated[int, Range(1, 65_536)]
+    beta: Annotated[float, Range(0, 1e6)]
+    drop_condition: Annotated[float, Range(0, 1)]
     time: UniformTime | LogitNormalTime
     sampler: SamplerSettings
     guidance: GuidanceConfig | None  # of the shape, null for none; masks go unguided

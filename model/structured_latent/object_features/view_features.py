@@ -8,6 +8,7 @@ The file's name is a digest of everything that decides its content: mesh, frame,
 import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from model.structured_latent.object_features.object_views import RENDERING, obje
 from model.structured_latent.object_features.surface_features import projected_features
 from model.structured_latent.object_features.view_encoder import ViewEncoder
 from model.tensor_files.safetensors_file import read_header, read_tensors, write_tensors
+from shards.settings import Range
 from shards.storage.bounded_cache import BoundedCache
 
 __all__ = ["ViewFeatures", "ViewFeaturesConfig"]
@@ -40,9 +42,9 @@ class ViewFeaturesConfig:
     | cache         | -       | folder of what is made, for all runs; null: kept in memory as far as 1 GiB goes |
     """
 
-    views: int
-    image_size: int
-    supersampling: int
+    views: Annotated[int, Range(1, 100_000)]
+    image_size: Annotated[int, Range(8, 8192)]
+    supersampling: Annotated[int, Range(1, 64)]
     cache: Path | None
 
     def __post_init__(self) -> None:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Annotated
 
 import torch
 from jaxtyping import Float
@@ -10,6 +11,7 @@ from torch import Tensor, nn
 from model.errors import ModelError
 from model.networks.attention import require_heads
 from model.networks.sparse.tensor import SparseTensor
+from shards.settings import Range
 
 __all__ = ["LatentNormalisation", "SlatDistribution", "SlatVaeConfig", "require_layout", "sample"]
 
@@ -30,15 +32,15 @@ class SlatVaeConfig:
     | resolution       | 64        | of the latent grid |
     """
 
-    feature_channels: int
-    channels: int
-    latent_channels: int
-    blocks: int
-    heads: int
-    mlp_ratio: int
-    window: int
-    upsample: tuple[int, ...]
-    resolution: int
+    feature_channels: Annotated[int, Range(1, 65_536)]
+    channels: Annotated[int, Range(1, 65_536)]
+    latent_channels: Annotated[int, Range(1, 65_536)]
+    blocks: Annotated[int, Range(1, 65_536)]
+    heads: Annotated[int, Range(1, 65_536)]
+    mlp_ratio: Annotated[int, Range(1, 65_536)]
+    window: Annotated[int, Range(1, 65_536)]
+    upsample: Annotated[tuple[int, ...], Range(1, 65_536)]
+    resolution: Annotated[int, Range(1, 65_536)]
 
     def __post_init__(self) -> None:
         sizes = (self.feature_channels, self.channels, self.latent_channels, self.heads, self.mlp_ratio)

@@ -14,6 +14,7 @@ be named and ranks that share a batch agree with one process.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Annotated
 
 import torch
 from jaxtyping import Float, Int
@@ -25,6 +26,7 @@ from model.networks.sparse.tensor import SparseTensor
 from model.structured_latent.vae.latent import SlatDistribution
 from model.structured_latent.vae.surface_lattice import DecodedLattice, decoded_lattice
 from model.surface.fields import CORNERS
+from shards.settings import Range
 
 __all__ = ["SurfaceLoss", "SurfaceLossConfig", "surface_loss"]
 
@@ -33,14 +35,14 @@ __all__ = ["SurfaceLoss", "SurfaceLossConfig", "surface_loss"]
 class SurfaceLossConfig:
     """Weights of the terms."""
 
-    distance: float
-    surface: float
-    normal: float
-    corner: float
-    color: float
-    deformation: float
-    kl: float
-    truncation: float  # voxels of the latent grid
+    distance: Annotated[float, Range(0, 1e6)]
+    surface: Annotated[float, Range(0, 1e6)]
+    normal: Annotated[float, Range(0, 1e6)]
+    corner: Annotated[float, Range(0, 1e6)]
+    color: Annotated[float, Range(0, 1e6)]
+    deformation: Annotated[float, Range(0, 1e6)]
+    kl: Annotated[float, Range(0, 1e6)]
+    truncation: Annotated[float, Range(1e-3, 1e3)]  # voxels of the latent grid
 
 
 @dataclass(frozen=True, kw_only=True)
