@@ -139,7 +139,11 @@ def test_small_needs_no_weights_of_others():
         ("held_out_cameras: 0.25", "held_out_cameras: 1.0", "0 <= share < 1"),
         ("    batch_size: 6", "    batch_size: 0", "'stage_one.recipe.batch_size': expected between 1 and"),
         ("views: [2, 3]", "views: [3, 2]", "'stage_one.recipe.views': expected .lowest, highest."),
-        ("    image_size: 128\n", "    image_size: 0\n", "'stage_one.recipe.image_size': expected between 8 and"),
+        (
+            "    image_size: 128\n",
+            "    image_size: 0\n",
+            "'stage_one.recipe.image_size': expected between 8 and",
+        ),
         ("guidance: null", "guidance: {strength: 0.0, interval: [0.5, 1.0]}", "`guidance: null` for none"),
         ("guidance: null", "guidance: {strength: 1.0, interval: [0.5, 1.5]}", "each between 0 and 1"),
         ("drop_condition: 0.1", "drop_condition: 1.7", "between 0 and 1"),
