@@ -124,5 +124,5 @@ def open_nail_mask_png() -> bytes:
 
 
 def _image(name: str, size: int) -> UInt8[np.ndarray, "row column 3"]:
-    image = Image.open(BytesIO((_DATA / name).read_bytes())).convert("RGB")
+    image = Image.open(BytesIO((_DATA / name).read_bytes()), formats=("PNG", "JPEG")).convert("RGB")
     return np.asarray(image.resize((size, size), Image.Resampling.BICUBIC))

@@ -21,7 +21,7 @@ class TextureError(ValueError):
 def decode_image(data: bytes, what: str) -> Image.Image:
     """Decode a PNG or JPEG completely. Raises TextureError naming `what`."""
     try:
-        image = Image.open(io.BytesIO(data))
+        image = Image.open(io.BytesIO(data), formats=("PNG", "JPEG"))
         image.load()
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
         raise TextureError(f"{what}: not a readable image ({error}); replace the file") from error

@@ -114,7 +114,7 @@ def _detail_image(rig: Path) -> Image.Image:
     end = raw.find(b"IEND", start) + 8
     if start < 0 or end < 8:
         raise SystemExit(f"{rig}: no packed PNG; expected human_rig.blend of morse-simulator-data 1.4-8")
-    return Image.open(BytesIO(raw[start:end]))
+    return Image.open(BytesIO(raw[start:end]), formats=("PNG", "JPEG"))
 
 
 def _blur(
@@ -152,7 +152,7 @@ def _skin(
     path: Path, layout: Layout, contrast: Float[np.ndarray, "row column"]
 ) -> Float[np.ndarray, "row column 3"]:
     """One skin as sRGB 0..255. Painted highlights of the nails give way to plain nail colour."""
-    color = _blur(_filled(_hand_crop(Image.open(path)), layout.good), 2.5)
+    color = _blur(_filled(_hand_crop(Image.open(path, formats=("PNG", "JPEG"))), layout.good), 2.5)
     beside = _filled(color, layout.good & (layout.plate < 0.01))
     brightness = float(beside[layout.inside].mean()) / 0.30
     bed = 0.66 * _blur(beside, 6.0) + 0.34 * np.array([0.66, 0.36, 0.30]) * np.clip(brightness, 0.55, 1.1)

@@ -154,7 +154,7 @@ def shipped_material(material: Material, look: Look) -> Material:
 
 def shipped_image(image: bytes) -> bytes:
     """The file as it is where it is small; otherwise at most 1024 px, JPEG."""
-    opened = Image.open(io.BytesIO(image))
+    opened = Image.open(io.BytesIO(image), formats=("PNG", "JPEG"))
     if max(opened.size) <= MAX_IMAGE_PX:
         return image
     factor = MAX_IMAGE_PX / max(opened.size)

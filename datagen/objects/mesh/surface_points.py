@@ -107,7 +107,7 @@ def _image_colors(
     image: bytes, uv: Float[np.ndarray, "point 2"], layout: ImageLayout
 ) -> Float[np.ndarray, "point 3"]:
     """Linear colours at `uv`, bilinear between texel centres."""
-    pixels = np.asarray(Image.open(io.BytesIO(image)).convert("RGB"))
+    pixels = np.asarray(Image.open(io.BytesIO(image), formats=("PNG", "JPEG")).convert("RGB"))
     height, width = pixels.shape[:2]
     x = _folded(uv[:, 0], layout.wrap_u) * width - 0.5
     y = (1.0 - _folded(uv[:, 1], layout.wrap_v)) * height - 0.5

@@ -40,7 +40,7 @@ def _texel_count(mesh: ObjectMesh) -> float:
         if image is None and any(material.emissive_rgb):
             image, layout = material.emissive_image, material.emissive_layout
         if image is not None:
-            width, height = Image.open(io.BytesIO(image)).size
+            width, height = Image.open(io.BytesIO(image), formats=("PNG", "JPEG")).size
             count += min(_uv_area(mesh.uv_of(layout)[chosen]), 1.0) * width * height
         elif mesh.corner_colors is not None:
             tinted = (mesh.corner_colors != 1.0).any(axis=(1, 2))

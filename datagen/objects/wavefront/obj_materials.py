@@ -22,6 +22,15 @@ GREY = (0.6, 0.6, 0.6)  # where no file tells of a material
 SHOWN = ("map_kd", "map_ke", "norm")
 BUMPS = ("map_bump", "bump")  # heights by the specification, normals by what Blender exports
 WHITE = (1.0, 1.0, 1.0)
+IMAGE_FORMATS = (
+    "PNG",
+    "JPEG",
+    "WEBP",
+    "BMP",
+    "TIFF",
+    "TGA",
+)  # in which maps of normals are kept; none runs a program
+MAX_NORMALS_PX = 8192  # larger images are not decoded to see what they are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,8 +153,8 @@ class ObjMaterials:
 def _shows_normals(image: bytes) -> bool:
     """Whether an image is a map of tangent-space normals: its mean points out of the surface."""
     try:
-        with Image.open(io.BytesIO(image)) as opened:
-            if opened.mode not in ("RGB", "RGBA"):
+        with Image.open(io.BytesIO(image), formats=IMAGE_FORMATS) as opened:
+            if opened.mode not in ("RGB", "RGBA") or max(opened.size) > MAX_NORMALS_PX:
                 return False
             mean = np.asarray(opened.convert("RGB").resize((16, 16), Image.Resampling.BOX)).mean(axis=(0, 1))
     except Exception:  # Pillow raises whatever its decoders raise; what is no image shows nothing
