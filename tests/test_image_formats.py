@@ -1,4 +1,4 @@
-"""Every image is opened with the list of formats that are expected there: Pillow starts Ghostscript for what says EPS."""
+"""Every image is opened with the formats that are expected there: Pillow starts Ghostscript for what says EPS."""
 
 import ast
 from pathlib import Path
