@@ -50,7 +50,7 @@ def read_obj(path: Path, *, max_file_mb: float, ignore_missing_images: bool = Fa
     return FileMesh(
         verts_file=elements.verts,
         faces=faces,
-        corner_uv=_placed_uv(elements.uvs, uv_indices, looks, face_material, notes),
+        corner_uv=_placed_uv(elements.uvs, uv_indices, looks, face_material),
         face_material=face_material,
         materials=tuple(look.material for look in looks),
         corner_colors=colors,
@@ -110,7 +110,6 @@ def _placed_uv(
     uv_indices: Int[np.ndarray, "face 3"],
     looks: list[ObjMaterial],
     face_material: Int[np.ndarray, " face"],
-    notes: list[str],
 ) -> Float[np.ndarray, "face 3 2"]:
     """Where each corner looks up the images of its material; (0, 0) where it has no coordinates."""
     table = np.concatenate([uvs, np.zeros((1, 2))])  # index -1
@@ -119,7 +118,4 @@ def _placed_uv(
         own = face_material == index
         if look.scale != (1.0, 1.0) or look.offset != (0.0, 0.0):
             placed[own] = placed[own] * look.scale + look.offset
-        beyond = ((placed[own] < 0.0) | (placed[own] > 1.0)).any(axis=(1, 2)) if look.clamps else np.zeros(0)
-        if beyond.any():
-            notes.append(f"material {shown(look.material.name)}: -clamp on is not drawn, the image repeats")
     return placed

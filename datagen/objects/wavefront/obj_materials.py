@@ -2,6 +2,7 @@
 
 import io
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from PIL import Image
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.files.named_files import NamedFiles
-from datagen.objects.mesh.object_mesh import Material
+from datagen.objects.mesh.object_mesh import ImageLayout, Material
 from datagen.objects.wavefront.lines import shown
 from datagen.objects.wavefront.mtl_file import RGB, MtlEntry, MtlMap
 from datagen.objects.wavefront.mtl_libraries import MtlLibraries
@@ -22,6 +23,7 @@ GREY = (0.6, 0.6, 0.6)  # where no file tells of a material
 SHOWN = ("map_kd", "map_ke", "norm")
 BUMPS = ("map_bump", "bump")  # heights by the specification, normals by what Blender exports
 WHITE = (1.0, 1.0, 1.0)
+CLAMPED = ImageLayout(wrap_u="clamp", wrap_v="clamp")
 IMAGE_FORMATS = (
     "PNG",
     "JPEG",
@@ -41,7 +43,6 @@ class ObjMaterial:
     plain_rgb: RGB  # display colour of vertices without one, where others have one
     scale: tuple[float, float] = (1.0, 1.0)
     offset: tuple[float, float] = (0.0, 0.0)
-    clamps: bool = False
 
 
 class ObjMaterials:
@@ -95,12 +96,12 @@ class ObjMaterials:
             self._notes.append(
                 f"material {shown(name)}: all its images are placed as {shown(placed[0].name)}"
             )
+        material = material_from_mtl(replace(entry, kd=WHITE) if whitened else entry, images)
         return ObjMaterial(
-            material=material_from_mtl(replace(entry, kd=WHITE) if whitened else entry, images),
+            material=_with_borders(material, entry.maps),
             plain_rgb=kd if whitened else WHITE,
             scale=placed[0].scale if placed else (1.0, 1.0),
             offset=placed[0].offset if placed else (0.0, 0.0),
-            clamps=any(image.clamps for image in placed),
         )
 
     def _grey(self, name: str, *, is_colored: bool) -> ObjMaterial:
@@ -148,6 +149,18 @@ class ObjMaterials:
         if path not in self._images:
             self._images[path] = self._files.read(path)
         return self._images[path]
+
+
+def _with_borders(material: Material, maps: Mapping[str, MtlMap]) -> Material:
+    """Images that are clamped show the colours of their borders beyond them; the others repeat."""
+    layouts = {key: CLAMPED if image.clamps else ImageLayout() for key, image in maps.items()}
+    normals = next((layouts[key] for key in ("norm", *BUMPS) if key in layouts), ImageLayout())
+    return replace(
+        material,
+        base_color_layout=layouts.get("map_kd", ImageLayout()),
+        emissive_layout=layouts.get("map_ke", ImageLayout()),
+        normal_layout=normals,
+    )
 
 
 def _shows_normals(image: bytes) -> bool:

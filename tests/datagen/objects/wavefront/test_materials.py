@@ -10,11 +10,14 @@ import pytest
 from PIL import Image
 
 from datagen.objects.errors import ObjectError
+from datagen.objects.formats.reading import ReadingConfig, read_object
+from datagen.objects.mesh.surface_points import sample_surface
 from datagen.objects.wavefront.mtl_file import read_mtl
 from datagen.objects.wavefront.obj_file import read_obj
-from shards.color import linear_from_srgb
+from shards.color import linear_from_srgb, srgb_from_linear
 
 RED = linear_from_srgb(np.array([0.9, 0.05, 0.05]))
+BLUE = linear_from_srgb(np.array([0.05, 0.05, 0.9]))
 
 
 def png(color=(200, 30, 30)) -> bytes:
@@ -262,10 +265,24 @@ def test_scale_and_offset_of_the_image_move_its_coordinates(obj):
     np.testing.assert_allclose(mesh.corner_uv[0], [[0.5, 0.25], [2.5, 0.25], [0.5, 3.25]])
 
 
-def test_an_image_that_should_be_clamped_is_told_of_where_that_shows(obj):
-    mtl = {"a.mtl": "newmtl m\nmap_Kd -clamp on wood.png\n", "wood.png": png()}
-    assert obj(TEXTURED, **mtl).notes == ()
-    assert "clamp" in " ".join(obj(TEXTURED.replace("vt 1 0", "vt 1.5 0"), **mtl).notes)
+@pytest.mark.parametrize(("option", "first", "last"), [("-clamp on", BLUE, BLUE), ("-clamp off", RED, BLUE)])
+def test_a_clamped_image_shows_its_border_beyond_it_and_others_repeat(tmp_path, option, first, last):
+    """A red and a blue half, seen from u = 1 to u = 2."""
+    halves = np.repeat(np.round(srgb_from_linear(np.array([RED, BLUE])) * 255).astype(np.uint8), 8, axis=0)
+    Image.fromarray(np.repeat(halves[None], 4, axis=0)).save(tmp_path / "halves.png")
+    (tmp_path / "a.mtl").write_text(f"newmtl m\nmap_Kd {option} halves.png\n")
+    (tmp_path / "a.obj").write_text(
+        "mtllib a.mtl\nusemtl m\nvt 1.0 0.5\nvt 2.0 0.5\nv 0 0 0\nv 0.2 0 0\nv 0.2 0.1 0\nv 0 0.1 0\n"
+        "f 1/1 2/2 3/2 4/1\n"
+    )
+    config = ReadingConfig(unit="m", up_axis="z", max_faces=9, max_image_px=99)
+    found = sample_surface(read_object(tmp_path / "a.obj", config).mesh, 500, np.random.default_rng(0))
+    along = (found.points_obj[:, 0] - found.points_obj[:, 0].min()) / np.ptp(found.points_obj[:, 0])
+    for part, color in (((along > 0.1) & (along < 0.4), first), (along > 0.6, last)):
+        assert part.sum() > 50
+        np.testing.assert_allclose(
+            linear_from_srgb(found.colors[part].astype(float)).mean(axis=0), color, atol=0.03
+        )
 
 
 def test_textured_faces_without_coordinates_are_told_of(obj):
