@@ -33,7 +33,6 @@ from model.training.clock import Clock
 from model.training.config import OptimizerConfig, TrainerConfig
 from model.training.ema import MovingAverage
 from model.training.precision import UsedPrecision, changes, this_machine, used_precision
-from model.training.sample_threads import SampleThreads
 from model.training.step_generators import sample_generators
 from model.training.task import Evaluation, Losses, Task
 
@@ -118,7 +117,6 @@ class _Run:
     writer: SummaryWriter | None
     checkpoints: Path
     precision: UsedPrecision
-    threads: SampleThreads
 
 
 def train(
@@ -160,8 +158,7 @@ def train(
             state = _restored(run, newest, state)
         if report is not None and accelerator.is_main_process:
             report(RunStarted(step=state.step, steps=config.steps, notices=notices))
-        batches = source.batches(state.epoch, state.samples_consumed)
-        with _StopFlag() as stop, run.threads, closing(batches):
+        with _StopFlag() as stop, closing(source.batches(state.epoch, state.samples_consumed)) as batches:
             return _loop(run, batches, state, validate, report, stop)
     finally:
         if run.writer is not None:
@@ -238,7 +235,6 @@ def _prepare(
         writer=SummaryWriter(folder / "tensorboard") if accelerator.is_main_process else None,
         checkpoints=folder / "checkpoints",
         precision=precision,
-        threads=SampleThreads(accelerator.device, torch.get_num_threads()),
     )
 
 
@@ -292,18 +288,14 @@ def _step(
             placed = next(batches)
         batch = placed.batch.to(accelerator.device, torch.float32)
         generators = sample_generators(config.seed, step * config.accumulate + part, placed.places)
-        losses = run.threads.backward(
-            run.task.loss,
-            batch,
-            generators,
-            run.parameters,
-            bfloat16=run.precision == "bfloat16",
-            weight=1 / config.accumulate,
-        )
+        bfloat16 = run.precision == "bfloat16"
+        with torch.autocast(accelerator.device.type, torch.bfloat16, enabled=bfloat16):
+            losses = run.task.loss(batch, generators)
         _require_finite(run, losses, batch, step)
         names += batch.names
+        (losses.total / config.accumulate).backward()
         for name, value in {"loss": losses.total, **losses.parts}.items():
-            sums[name] = sums.get(name, 0.0) + value.float() / config.accumulate
+            sums[name] = sums.get(name, 0.0) + value.detach().float() / config.accumulate
         clock.count(len(placed.batch.ids) * accelerator.num_processes)
     assert placed is not None  # `accumulate` is at least 1
     _average_gradients(run)
@@ -342,10 +334,10 @@ def _require_finite(run: _Run, losses: Losses, batch: Batch, step: int) -> None:
     bad = not bool(torch.isfinite(losses.total))
     if not _any(run.accelerator, bad):
         return
-    parts = ", ".join(f"{name} {float(value):.4g}" for name, value in losses.parts.items())
+    parts = ", ".join(f"{name} {float(value.detach()):.4g}" for name, value in losses.parts.items())
     whose = f"samples {', '.join(batch.names)}" if bad else "samples of another rank (see its message)"
     raise NonFiniteLossError(
-        f"step {step}: the loss is {float(losses.total)} ({parts}) for {whose}; expected a finite number. "
+        f"step {step}: the loss is {float(losses.total.detach())} ({parts}) for {whose}; expected a finite number. "
         f"Look at these samples, or lower optimizer.learning_rate; training resumes from the newest checkpoint "
         f"in {run.checkpoints}"
     )

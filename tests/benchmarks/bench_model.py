@@ -32,7 +32,6 @@ from model.sparse_structure.dual_branch import DualBranchFlow
 from model.sparse_structure.stage_one import StageOne, StageOneConfig, StageOneTask
 from model.sparse_structure.vae import StructureVae
 from model.training.precision import used_precision
-from model.training.sample_threads import SampleThreads
 from model.training.step_generators import sample_generators
 from model.training.trainer import StepReport, TrainingEvent, train
 
@@ -262,14 +261,13 @@ def print_speeds() -> None:
     precision, _ = used_precision("auto", DEVICE)
     parameters = [parameter for parameter in task.module.parameters() if parameter.requires_grad]
     optimizer = torch.optim.AdamW(parameters, lr=1e-4)
-    threads = SampleThreads(DEVICE, torch.get_num_threads())
 
     def step(index: int) -> float:
         start = time.perf_counter()
         generators = sample_generators(0, index, range(samples))
-        threads.backward(
-            task.loss, batch, generators, parameters, bfloat16=precision == "bfloat16", weight=1.0
-        )
+        with torch.autocast(DEVICE.type, torch.bfloat16, enabled=precision == "bfloat16"):
+            loss = task.loss(batch, generators).total
+        loss.backward()
         optimizer.step()
         optimizer.zero_grad()
         return samples / (time.perf_counter() - start)

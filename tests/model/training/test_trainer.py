@@ -19,8 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from model.errors import ModelError
 from model.training.checkpoint import latest_checkpoint, load_average, read_state
 from model.training.config import TrainerConfig
-from model.training.step_generators import normal_like
-from model.training.task import Evaluation, Losses
+from model.training.task import Evaluation
 from model.training.trainer import (
     NonFiniteLossError,
     RunStarted,
@@ -119,33 +118,6 @@ def test_k_steps_and_a_resume_equal_a_run_in_one_go_bit_for_bit(tmp_path, steps)
     assert state.step == last
     assert source.seen[0] == 4 * first  # not one sample twice
     assert_same_tensors(tmp_path / "whole", tmp_path / "parts")
-
-
-class _Stateless(ToyTask):
-    """Threads would count their calls at the same time."""
-
-    def loss(self, batch, generators):
-        predicted = self.net(batch.images + 0.1 * normal_like(batch.images, generators))
-        error = (predicted - batch.images.mean(dim=(1, 3, 4))).square().mean()
-        return Losses(total=error, parts={"color": error})
-
-
-def test_a_resume_is_bit_exact_with_threads_too(tmp_path):
-    torch.set_num_threads(4)
-    config = settings(10, checkpoint_every=1, accumulate=2)
-    run(tmp_path / "whole", config, task=_Stateless())
-
-    def stop(report: TrainingEvent) -> None:
-        if report.step == 8:
-            raise InterruptedError
-
-    with pytest.raises(InterruptedError):
-        run(tmp_path / "parts", config, task=_Stateless(), report=stop)
-    run(tmp_path / "parts", config, task=_Stateless())
-    assert_same_tensors(tmp_path / "whole", tmp_path / "parts")
-    torch.set_num_threads(1)
-    run(tmp_path / "one", config, task=_Stateless())
-    assert_same_tensors(tmp_path / "whole", tmp_path / "one", rtol=1e-3, atol=1e-5)
 
 
 def test_a_run_says_and_records_its_machine_and_what_is_new_where_it_is_resumed(tmp_path):
