@@ -48,14 +48,12 @@ class CachedEncoder:
         keys = [_content(view) for view in views]
         tokens = {key: self._kept[key] for key in keys if key in self._kept}
         if new := {key: index for index, key in enumerate(keys) if key not in tokens}:
-            for (
-                key,
-                index,
-            ) in new.items():  # one by one: kept bits do not depend on which images came together
-                with torch.autocast(images.device.type, enabled=False):
-                    tokens[key] = self.encoder(views[index][None, None])[0, 0].to(images.dtype)
+            with torch.autocast(images.device.type, enabled=False):
+                computed = self.encoder(views[list(new.values())][None])[0].to(images.dtype)
+            for key, value in zip(new, computed):
+                tokens[key] = value
                 if len(self._kept) < self.max_views:
-                    self._kept[key] = tokens[key]
+                    self._kept[key] = value.clone()  # a row would keep the whole batch alive
         return torch.stack([tokens[key] for key in keys]).unflatten(0, images.shape[:2])
 
 

@@ -2,7 +2,6 @@
 
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
-from threading import Lock
 from typing import Generic, TypeVar
 
 __all__ = ["BoundedCache"]
@@ -11,30 +10,22 @@ Item = TypeVar("Item")
 
 
 class BoundedCache(Generic[Item]):
-    """Least recently used items go when their sizes exceed the limit; the newest always stays.
-
-    Threads may share it. Two that ask for the same missing item at once both read it.
-    """
+    """Least recently used items go when their sizes exceed the limit; the newest always stays."""
 
     def __init__(self, limit: int) -> None:
         self._limit = limit
         self._total = 0
-        self._lock = Lock()
         self._items: OrderedDict[Hashable, tuple[Item, int]] = OrderedDict()
 
     def get(self, key: Hashable, read: Callable[[], Item], size: Callable[[Item], int]) -> Item:
         """The item of `key`; `read` makes it when it is not there, `size` says what it takes."""
-        with self._lock:
-            if key in self._items:
-                self._items.move_to_end(key)
-                return self._items[key][0]
+        if key in self._items:
+            self._items.move_to_end(key)
+            return self._items[key][0]
         item = read()
-        with self._lock:
-            if key in self._items:  # another thread was faster
-                return self._items[key][0]
-            self._items[key] = (item, size(item))
-            self._total += self._items[key][1]
-            while self._total > self._limit and len(self._items) > 1:
-                _, (_, freed) = self._items.popitem(last=False)
-                self._total -= freed
+        self._items[key] = (item, size(item))
+        self._total += self._items[key][1]
+        while self._total > self._limit and len(self._items) > 1:
+            _, (_, freed) = self._items.popitem(last=False)
+            self._total -= freed
         return item

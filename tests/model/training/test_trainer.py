@@ -39,12 +39,11 @@ def run(
     config: TrainerConfig,
     *,
     source: ToySource | None = None,
-    task: ToyTask | None = None,
     sha: str = "toy",
     yaml: str = "toy",
     **options,
 ):
-    task = task or ToyTask()
+    task = ToyTask()
     source = source or ToySource(4)
     state = train(
         task,
@@ -57,15 +56,6 @@ def run(
         **options,
     )
     return task, state, source
-
-
-@pytest.fixture(autouse=True)
-def one_thread():
-    """As in the processes that these tests start; the order of sums is then the same."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
 
 
 def run_steps(folder: Path, config: TrainerConfig, **options) -> list[StepReport]:
