@@ -5,7 +5,8 @@ import bpy
 from datagen.blender.geometry import CORNER_COLORS, uv_layer_name
 from datagen.blender.shading.images import add_image
 from datagen.blender.shading.nodes import Graph, Input, new_material, replace_surface, surface
-from datagen.objects.mesh.object_mesh import ImageLayout, Material, Wrap
+from datagen.objects.mesh.object_mesh import ImageLayout, Material
+from shards.texture_wrap import Wrap
 
 __all__ = ["object_material"]
 

@@ -8,14 +8,15 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.objects.formats.reading import ROTATION_FROM_Y_UP
-from datagen.objects.mesh.object_mesh import ImageLayout, Material, ObjectMesh, Wrap
+from datagen.objects.mesh.object_mesh import ImageLayout, Material, ObjectMesh
 from datagen.objects.mesh.surface_points import face_normals
+from shards.texture_wrap import WRAPS, Wrap
 
 __all__ = ["corner_normals", "mesh_to_glb"]
 
 FLOAT, UINT32, UINT16 = 5126, 5125, 5123
 ARRAY_BUFFER, ELEMENT_BUFFER = 34962, 34963
-WRAP_CODES: dict[Wrap, int] = {"repeat": 10497, "mirror": 33648, "clamp": 33071}
+WRAP_CODES = {wrap: code for code, wrap in WRAPS.items()}
 PNG_SIGNATURE = b"\x89PNG"
 AUTO_SMOOTH_RAD = np.deg2rad(40.0)
 

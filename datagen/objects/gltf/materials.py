@@ -12,7 +12,8 @@ from datagen.objects.errors import ObjectError
 from datagen.objects.gltf.container import GltfFile
 from datagen.objects.gltf.specular_gloss import SpecularGloss, metallic_roughness
 from datagen.objects.gltf.texture_images import has_alpha, permitted_image
-from datagen.objects.mesh.object_mesh import ImageLayout, Material, Wrap
+from datagen.objects.mesh.object_mesh import ImageLayout, Material
+from shards.texture_wrap import WRAPS, Wrap
 
 __all__ = ["SPECULAR_GLOSS", "UNLIT", "WEBP", "GltfMaterial", "UvSource", "read_material"]
 
@@ -24,7 +25,6 @@ IOR = "KHR_materials_ior"
 DRAWN = (SPECULAR_GLOSS, UNLIT, EMISSIVE_STRENGTH, TRANSMISSION, IOR)
 WEBP = "EXT_texture_webp"
 UNLIT_ROUGHNESS = 0.9  # of the fallback in the extension's own example
-WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 # How to get images of which a file has none that is read here.
 CONVERSIONS = {
     "KHR_texture_basisu": "Convert the textures: `npx @gltf-transform/cli ktxdecompress in.glb out.glb`."

@@ -2,14 +2,14 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-__all__ = ["ImageLayout", "Material", "ObjectMesh", "Wrap"]
+from shards.texture_wrap import Wrap
 
-Wrap = Literal["repeat", "mirror", "clamp"]
+__all__ = ["ImageLayout", "Material", "ObjectMesh"]
 
 
 @dataclass(frozen=True, kw_only=True)

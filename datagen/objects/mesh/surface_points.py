@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from PIL import Image
 
-from datagen.objects.mesh.object_mesh import ImageLayout, ObjectMesh, Wrap
+from datagen.objects.mesh.object_mesh import ImageLayout, ObjectMesh
 from shards.color import linear_from_srgb, srgb_from_linear
+from shards.texture_wrap import Wrap, wrapped_texel
 
 __all__ = [
     "SurfaceSamples",
@@ -115,7 +116,10 @@ def _image_colors(
     fx, fy = (x - x0)[:, None], (y - y0)[:, None]
 
     def texel(dy: int, dx: int) -> Float[np.ndarray, "point 3"]:
-        row, column = _wrapped(y0 + dy, height, layout.wrap_v), _wrapped(x0 + dx, width, layout.wrap_u)
+        row, column = (
+            wrapped_texel(y0 + dy, height, layout.wrap_v),
+            wrapped_texel(x0 + dx, width, layout.wrap_u),
+        )
         return linear_from_srgb(pixels[row, column] / 255.0)
 
     top = (1 - fx) * texel(0, 0) + fx * texel(0, 1)
@@ -128,16 +132,6 @@ def _folded(coordinate: Float[np.ndarray, " point"], wrap: Wrap) -> Float[np.nda
     if wrap == "clamp":
         return np.clip(coordinate, -1.0, 2.0)
     return np.mod(coordinate, 2.0 if wrap == "mirror" else 1.0)
-
-
-def _wrapped(index: Int[np.ndarray, " point"], count: int, wrap: Wrap) -> Int[np.ndarray, " point"]:
-    """The texel that is seen at an index beyond the image."""
-    if wrap == "clamp":
-        return np.clip(index, 0, count - 1)
-    if wrap == "repeat":
-        return index % count
-    within = index % (2 * count)
-    return np.where(within < count, within, 2 * count - 1 - within)
 
 
 def sample_surface(

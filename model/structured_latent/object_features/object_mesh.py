@@ -10,7 +10,7 @@ import json
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -22,13 +22,11 @@ from model.surface.export import ROTATION_YUP_FROM_OBJ
 from shards.color import linear_from_srgb, srgb_from_linear
 from shards.errors import DatasetNotFoundError
 from shards.reader import Shard
+from shards.texture_wrap import WRAPS, Wrap
 
-__all__ = ["MeshRecord", "ObjectMeshes", "TexturedMesh", "Wrap", "textured_mesh"]
-
-Wrap = Literal["repeat", "mirror", "clamp"]
+__all__ = ["MeshRecord", "ObjectMeshes", "TexturedMesh", "textured_mesh"]
 
 _WHITE = np.full((1, 1, 3), 255, dtype=np.uint8)
-_WRAPS: dict[int, Wrap] = {10497: "repeat", 33648: "mirror", 33071: "clamp"}
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,7 +212,7 @@ def _texture_look(
     return _Look(
         factor=factor,
         texture=np.asarray(image.convert("RGB")),
-        wraps=(_WRAPS[sampler.get("wrapS", 10497)], _WRAPS[sampler.get("wrapT", 10497)]),
+        wraps=(WRAPS[sampler.get("wrapS", 10497)], WRAPS[sampler.get("wrapT", 10497)]),
         tex_coord=info.get("texCoord", 0),
     )
 

@@ -12,10 +12,11 @@ import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from scipy.stats import qmc
 
-from model.structured_latent.object_features.object_mesh import TexturedMesh, Wrap
+from model.structured_latent.object_features.object_mesh import TexturedMesh
 from model.surface.rasteriser import rasterise
 from shards.color import linear_from_srgb, srgb_from_linear
 from shards.geometry import intrinsics_from_fov, look_at
+from shards.texture_wrap import Wrap, wrapped_texel
 
 __all__ = ["RENDERING", "ObjectView", "object_views", "sphere_cameras"]
 
@@ -163,18 +164,8 @@ def _texels(
     def at(
         row: Int[np.ndarray, " pixel"], column: Int[np.ndarray, " pixel"]
     ) -> Float32[np.ndarray, "pixel 3"]:
-        return _LINEAR[image[_wrapped(row, height, wraps[1]), _wrapped(column, width, wraps[0])]]
+        return _LINEAR[image[wrapped_texel(row, height, wraps[1]), wrapped_texel(column, width, wraps[0])]]
 
     above = (1.0 - right) * at(row, column) + right * at(row, column + 1)
     below = (1.0 - right) * at(row + 1, column) + right * at(row + 1, column + 1)
     return ((1.0 - down) * above + down * below).astype(np.float32)
-
-
-def _wrapped(index: Int[np.ndarray, " pixel"], count: int, wrap: Wrap) -> Int[np.ndarray, " pixel"]:
-    """The texel that is seen at an index beyond the image."""
-    if wrap == "clamp":
-        return np.clip(index, 0, count - 1)
-    if wrap == "repeat":
-        return index % count
-    within = index % (2 * count)
-    return np.where(within < count, within, 2 * count - 1 - within)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datagen.objects.mesh.object_mesh import ImageLayout, Material, ObjectMesh, Wrap
+from datagen.objects.mesh.object_mesh import ImageLayout, Material, ObjectMesh
 from datagen.scene.scene import CameraPath, RenderSettings, Scene
 from shards.geometry import look_at
+from shards.texture_wrap import Wrap
 
 pytestmark = pytest.mark.blender
 WRAPS: tuple[Wrap, ...] = ("repeat", "mirror", "clamp")
