@@ -41,19 +41,26 @@ class NamedFiles:
         Letters may differ in case, backslashes count as slashes. Where none leads to a file inside,
         their ends are tried (`C:\\job\\maps\\wood.png` as `maps/wood.png` and as `wood.png`).
         """
-        parts_of_names = [_parts(name) for name in names]
-        for parts in parts_of_names:
-            for folder in folders:
-                path = self._walk(folder, parts)
-                if path is not None:
-                    return FoundFile(path=path, guessed=False)
-        for parts in parts_of_names:
+        there = self.find_there(names, folders)
+        if there is not None:
+            return FoundFile(path=there, guessed=False)
+        for parts in map(_parts, names):
             plain = tuple(part for part in parts if part != ".." and not _is_anchor(part))
             for tail in (plain[start:] for start in range(max(len(plain) - MAX_TAIL, 0), len(plain))):
                 for folder in folders:
                     path = self._walk(folder, tail)
                     if path is not None:
                         return FoundFile(path=path, guessed=True)
+        return None
+
+    def find_there(self, names: Sequence[str], folders: Sequence[Path]) -> Path | None:
+        """As `find`, but only where the names say. A backslash may also be part of a name (a zip of Windows)."""
+        for name in names:
+            for parts in dict.fromkeys((_parts(name), PurePosixPath(name).parts)):
+                for folder in folders:
+                    path = self._walk(folder, parts)
+                    if path is not None:
+                        return path
         return None
 
     def read(self, path: Path) -> bytes:

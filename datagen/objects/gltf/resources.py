@@ -1,12 +1,12 @@
 """What a glTF file refers to by URI: data inside of it, or files beside it."""
 
 import base64
-import unicodedata
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from urllib.parse import unquote, unquote_to_bytes, urlsplit
 
 from datagen.objects.errors import ObjectError
+from datagen.objects.files.named_files import NamedFiles
 
 __all__ = ["SHOWN_CHARS", "Resources"]
 
@@ -41,12 +41,13 @@ class Resources:
                 expected="files in its own folder or below",
                 action="Put the file beside the .gltf and correct the uri, or export one .glb.",
             )
-        file = _found(self.path.parent, uri)
+        files = NamedFiles(self.path, self.max_bytes / 1e6)
+        file = files.find_there((unquote(uri), uri), (self.path.parent,))
         if file is None:
             raise ObjectError(
                 self.path,
                 f"{kind} {shown!r} is missing",
-                expected=f"a file at {self.path.parent / unquote(uri)}",
+                expected=f"a file at {self.path.parent / unquote(uri)}, no link out of the folder",
                 action="Keep the files of a .gltf together, or export one .glb.",
             )
         if file.stat().st_size > self.max_bytes:
@@ -87,36 +88,3 @@ def _leaves_folder(uri: str) -> bool:
     parts = urlsplit(uri)
     path = PurePosixPath(unquote(uri).replace("\\", "/"))
     return bool(parts.scheme or parts.netloc) or path.is_absolute() or ".." in path.parts
-
-
-def _found(folder: Path, uri: str) -> Path | None:
-    """The file that a URI means: percent-encoded as it should be, or as it stands.
-
-    Exporters also write backslashes, another case, or letters composed otherwise than on this disk.
-    """
-    names = (unquote(uri), uri)
-    for name in (*names, *(name.replace("\\", "/") for name in names)):
-        file = _descend(folder, PurePosixPath(name).parts)
-        if file is not None:
-            return file
-    return None
-
-
-def _descend(folder: Path, parts: tuple[str, ...]) -> Path | None:
-    at = folder
-    try:
-        for part in parts:
-            exact = at / part
-            if not exact.exists():
-                alike = [entry for entry in at.iterdir() if _folded(entry.name) == _folded(part)]
-                if len(alike) != 1:
-                    return None
-                exact = alike[0]
-            at = exact
-        return at if at.is_file() else None
-    except (OSError, ValueError):  # no folder, a name too long, a NUL in it
-        return None
-
-
-def _folded(name: str) -> str:
-    return unicodedata.normalize("NFC", name).casefold()

@@ -15,7 +15,7 @@ def file_beside(mesh: Path, written: str) -> Path | None:
 @pytest.fixture
 def mesh(tmp_path):
     (tmp_path / "mesh" / "textures").mkdir(parents=True)
-    for name in ("Tex.png", "textures/deep.png", "with space.png", "größe.png"):
+    for name in ("Tex.png", "textures/deep.png", "with space.png", "größe.png", "maps\\flat.png"):
         (tmp_path / "mesh" / name).write_bytes(b"")
     (tmp_path / "secret.png").write_bytes(b"")
     return tmp_path / "mesh" / "a.ply"
@@ -34,6 +34,7 @@ def mesh(tmp_path):
         ("../elsewhere/Tex.png", "Tex.png"),
         (" with space.png ", "with space.png"),
         ("gro\u0308ße.png", "größe.png"),  # as a Mac spells it
+        ("maps\\flat.png", "maps\\flat.png"),  # one name, as a zip of Windows unpacks
     ],
 )
 def test_written_names_are_found(mesh, written, found):

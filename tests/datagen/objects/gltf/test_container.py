@@ -175,6 +175,20 @@ def test_names_of_files_beside_it(tmp_path, on_disk, in_file):
     assert is_square(read(tmp_path / "a.gltf", text_of(made, in_file)))
 
 
+def test_a_link_does_not_lead_out_of_the_folder(tmp_path):
+    made, folder = square(), tmp_path / "model"
+    folder.mkdir()
+    for place in (tmp_path / "private.bin", folder / "own.bin"):
+        place.write_bytes(made.binary)
+    (folder / "out.bin").symlink_to(tmp_path / "private.bin")
+    (folder / "in.bin").symlink_to("own.bin")
+    assert is_square(read(folder / "in.gltf", text_of(made, "in.bin")))
+    with pytest.raises(
+        ObjectError, match=r"buffer 'out\.bin' is missing; expected .* no link out of the folder"
+    ):
+        read(folder / "out.gltf", text_of(made, "out.bin"))
+
+
 def test_a_name_that_two_files_could_mean_is_missing(tmp_path):
     made = square()
     for name in ("A.bin", "a.BIN"):
