@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.objects.errors import ObjectError
+from datagen.objects.files.texture_images import permitted_image
 from datagen.objects.formats.ply import read_ply
 from datagen.objects.formats.stl import read_stl
 from datagen.objects.formats.units import METRES_PER, Unit, unit_of_size
 from datagen.objects.gltf.container import MAX_FILE_MB
 from datagen.objects.gltf.scene import read_gltf
-from datagen.objects.gltf.texture_images import permitted_image
 from datagen.objects.mesh.file_mesh import FileMesh, refuse_too_many_faces
 from datagen.objects.mesh.object_mesh import Material, ObjectMesh
 from datagen.objects.wavefront.obj_file import read_obj

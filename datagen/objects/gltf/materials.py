@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from datagen.objects.errors import ObjectError
+from datagen.objects.files.texture_images import has_alpha, permitted_image
 from datagen.objects.gltf.container import GltfFile
 from datagen.objects.gltf.specular_gloss import SpecularGloss, metallic_roughness
-from datagen.objects.gltf.texture_images import has_alpha, permitted_image
 from datagen.objects.mesh.object_mesh import ImageLayout, Material
 from shards.texture_wrap import WRAPS, Wrap
 

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from datagen.objects.errors import ObjectError
+from datagen.objects.files.texture_images import MAX_IMAGE_PX
 from datagen.objects.gltf.container import MAX_FILE_MB, UNPACKING, GltfFile, damaged_gltf, open_gltf
 from datagen.objects.gltf.draco import DRACO, DracoPrimitive, decoded_primitive
 from datagen.objects.gltf.materials import WEBP, GltfMaterial, UvSource, read_material
 from datagen.objects.gltf.motion import refuse_what_moves
 from datagen.objects.gltf.nodes import INSTANCING, VISIBILITY, placed_meshes
-from datagen.objects.gltf.texture_images import MAX_IMAGE_PX
 from datagen.objects.mesh.file_mesh import FileMesh, refuse_too_many_faces
 from datagen.objects.mesh.object_mesh import Material
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from datagen.objects.gltf.texture_images import decoded_rgba
+from datagen.objects.files.texture_images import decoded_rgba
 from shards.color import linear_from_srgb, srgb_from_linear
 
 __all__ = ["MetallicRoughness", "SpecularGloss", "metallic_roughness"]

@@ -11,6 +11,7 @@ from PIL import Image
 
 from datagen.objects.errors import ObjectError
 from datagen.objects.files.named_files import NamedFiles
+from datagen.objects.files.texture_images import MAX_IMAGE_PX, TEXTURE_FORMATS
 from datagen.objects.mesh.object_mesh import ImageLayout, Material
 from datagen.objects.wavefront.lines import shown
 from datagen.objects.wavefront.mtl_file import RGB, MtlEntry, MtlMap
@@ -24,15 +25,6 @@ SHOWN = ("map_kd", "map_ke", "norm")
 BUMPS = ("map_bump", "bump")  # heights by the specification, normals by what Blender exports
 WHITE = (1.0, 1.0, 1.0)
 CLAMPED = ImageLayout(wrap_u="clamp", wrap_v="clamp")
-IMAGE_FORMATS = (
-    "PNG",
-    "JPEG",
-    "WEBP",
-    "BMP",
-    "TIFF",
-    "TGA",
-)  # in which maps of normals are kept; none runs a program
-MAX_NORMALS_PX = 8192  # larger images are not decoded to see what they are
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -166,8 +158,8 @@ def _with_borders(material: Material, maps: Mapping[str, MtlMap]) -> Material:
 def _shows_normals(image: bytes) -> bool:
     """Whether an image is a map of tangent-space normals: its mean points out of the surface."""
     try:
-        with Image.open(io.BytesIO(image), formats=IMAGE_FORMATS) as opened:
-            if opened.mode not in ("RGB", "RGBA") or max(opened.size) > MAX_NORMALS_PX:
+        with Image.open(io.BytesIO(image), formats=TEXTURE_FORMATS) as opened:
+            if opened.mode not in ("RGB", "RGBA") or max(opened.size) > MAX_IMAGE_PX:
                 return False
             mean = np.asarray(opened.convert("RGB").resize((16, 16), Image.Resampling.BOX)).mean(axis=(0, 1))
     except Exception:  # Pillow raises whatever its decoders raise; what is no image shows nothing

@@ -12,11 +12,11 @@ from PIL import Image
 
 from datagen.objects.errors import ObjectError
 
-__all__ = ["MAX_IMAGE_PX", "decoded_rgba", "has_alpha", "permitted_image"]
+__all__ = ["MAX_IMAGE_PX", "TEXTURE_FORMATS", "decoded_rgba", "has_alpha", "permitted_image"]
 
 MAX_IMAGE_PX = 8192  # of a side: 256 MiB decoded
 # Tried in this order; TGA has no signature and comes last. Nothing here runs a program (as EPS would).
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "TGA")
+TEXTURE_FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TIFF", "TGA")
 READ_HERE = "PNG, JPEG, WebP, BMP, TGA, GIF or TIFF"
 KEPT_FORMATS = ("PNG", "JPEG", "MPO")  # MPO: a JPEG that others follow
 KEPT_MODES = ("1", "L", "LA", "P", "RGB", "RGBA")
@@ -46,7 +46,7 @@ def permitted_image(data: bytes, source: object, what: str, max_px: int) -> byte
     damaged, of a kind that is not read here, or has a side above `max_px`, before it is decoded.
     """
     try:
-        opened = Image.open(io.BytesIO(data), formats=FORMATS)
+        opened = Image.open(io.BytesIO(data), formats=TEXTURE_FORMATS)
         if max(opened.size) <= max_px:
             opened.load()
             kept = opened.format in KEPT_FORMATS and opened.mode in KEPT_MODES
@@ -72,13 +72,13 @@ def permitted_image(data: bytes, source: object, what: str, max_px: int) -> byte
 
 def decoded_rgba(data: bytes) -> Image.Image:
     """What `permitted_image` gave, decoded as RGBA."""
-    return Image.open(io.BytesIO(data), formats=FORMATS).convert("RGBA")
+    return Image.open(io.BytesIO(data), formats=TEXTURE_FORMATS).convert("RGBA")
 
 
 def has_alpha(data: bytes) -> bool:
     """Whether an image has a channel or a colour for transparency; False where it cannot be opened."""
     try:
-        return _shows_through(Image.open(io.BytesIO(data), formats=FORMATS))
+        return _shows_through(Image.open(io.BytesIO(data), formats=TEXTURE_FORMATS))
     except Exception:  # Pillow raises whatever its decoders raise; `permitted_image` says what is wrong
         return False
 

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from datagen.objects.errors import ObjectError
-from datagen.objects.gltf.texture_images import has_alpha, permitted_image
+from datagen.objects.files.texture_images import has_alpha, permitted_image
 
 GREYS = np.linspace(0, 65535, 64).round().astype(np.uint16).reshape(8, 8)
 RGB = np.random.default_rng(0).integers(0, 256, (8, 8, 3), dtype=np.uint8)
