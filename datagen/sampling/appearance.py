@@ -34,9 +34,8 @@ class AppearanceConfig:
     subsurface: Annotated[tuple[float, float], Range(0, 1, rising=True)]
     bump: Annotated[tuple[float, float], Range(0, 1, rising=True)]
     nail_gloss: Annotated[tuple[float, float], Range(0, 1, rising=True)]
-    forearm_length_m: Annotated[
-        tuple[float, float], Range(0.05, 0.6, rising=True)
-    ]  # at most what the grasps were simulated with
+    # at most what the grasps were simulated with
+    forearm_length_m: Annotated[tuple[float, float], Range(0.05, 0.6, rising=True)]
     forearm_girth: Annotated[tuple[float, float], Range(0.1, 10, rising=True)]
     sleeve_probability: Annotated[float, Range(0, 1)]
     sleeve_start_m: Annotated[tuple[float, float], Range(0, 1, rising=True)]  # from the wrist

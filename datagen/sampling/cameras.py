@@ -45,25 +45,22 @@ class CamerasConfig:
     image_size: Annotated[tuple[int, int], Range(16, 8192)]  # (width, height) in pixels
     margin: Annotated[float, Range(0, 0.45)]  # fraction kept free at every border
     near_m: Annotated[float, Range(0.001, 10)]  # no hand or object vertex nearer
-    slack: Annotated[
-        tuple[float, float], Range(1, 10, rising=True)
-    ]  # distance over the one that just frames the subject, >= 1
+    # distance over the one that just frames the subject, >= 1
+    slack: Annotated[tuple[float, float], Range(1, 10, rising=True)]
     max_drift: Annotated[float, Range(0, 1)]  # fraction; of the object's centre from its mean place
     smoothing_s: Annotated[float, Range(0, 60)]
     limits: MotionLimits
     styles: PathStyles
-    free_elevation_deg: Annotated[
-        tuple[float, float], Range(-90, 90, rising=True)
-    ]  # without a table (egocentric keeps its own)
+    # without a table (egocentric keeps its own)
+    free_elevation_deg: Annotated[tuple[float, float], Range(-90, 90, rising=True)]
     table_clearance_m: Annotated[float, Range(0, 10)]  # cameras stay so far above the plane of the table
     arm_clearance_m: Annotated[float, Range(0, 10)]
     min_visible: Annotated[float, Range(0, 1)]  # visible fraction of the object, worst frame
     min_visible_mean: Annotated[float, Range(0, 1)]
     min_object_size: Annotated[float, Range(0, 1)]  # fraction; square root of the object's area, worst frame
     attempts: Annotated[int, Range(1, 100_000)]  # candidates per camera
-    arm_end_attempts: Annotated[
-        int, Range(0, 100_000)
-    ]  # so many of them may be refused for showing where the drawn arm ends
+    # so many of them may be refused for showing where the drawn arm ends
+    arm_end_attempts: Annotated[int, Range(0, 100_000)]
     probe_rays: Annotated[int, Range(4, 4096)]  # rays across the image
 
     def __post_init__(self) -> None:

@@ -22,16 +22,13 @@ class ClipConfig:
     """Length and rate of the clips of a motion."""
 
     n_frames: Annotated[int, Range(1, 10_000)]
-    fps: Annotated[
-        tuple[float, ...], Range(0.1, 1000)
-    ]  # one is drawn per motion, among those the motion is long enough for
-    pickup_probability: Annotated[
-        float, Range(0, 1)
-    ]  # of a clip that begins while the object still lies on a table
+    # one is drawn per motion, among those the motion is long enough for
+    fps: Annotated[tuple[float, ...], Range(0.1, 1000)]
+    # of a clip that begins while the object still lies on a table
+    pickup_probability: Annotated[float, Range(0, 1)]
     before_grasp_s: Annotated[float, Range(0, 60)]  # how much of the approach may be seen then
-    preference: Annotated[
-        float, Range(0, 1000)
-    ]  # 0: any part of the motion; larger: parts in which the object moves most
+    # 0: any part of the motion; larger: parts in which the object moves most
+    preference: Annotated[float, Range(0, 1000)]
 
 
 @dataclass(frozen=True, kw_only=True)

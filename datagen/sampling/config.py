@@ -20,9 +20,8 @@ class RenderConfig:
     samples: Annotated[int, Range(1, 65_536)]
     max_bounces: Annotated[int, Range(0, 1024)]
     denoise: bool
-    exposure_ev: Annotated[
-        tuple[float, float], Range(-32, 32, rising=True)
-    ]  # (lowest, highest) of a uniform draw
+    # (lowest, highest) of a uniform draw
+    exposure_ev: Annotated[tuple[float, float], Range(-32, 32, rising=True)]
     view_transform: Literal["AgX", "Filmic", "Standard"]
 
 

@@ -24,15 +24,12 @@ SRGB_FROM_XYZ = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415],
 class LightsConfig:
     """Light of a motion. Pairs are (lowest, highest) of a uniform draw."""
 
-    card_level: Annotated[
-        tuple[float, float], Range(0, 1000, rising=True)
-    ]  # white card facing the key lamp, environment included
-    hdri_share: Annotated[
-        tuple[float, float], Range(0, 1, rising=True)
-    ]  # of that level; the key lamp has the rest
-    hdris: Annotated[
-        dict[str, float], Range(0, 1000)
-    ]  # name or path of an EXR -> factor on its share (a night stays dark)
+    # white card facing the key lamp, environment included
+    card_level: Annotated[tuple[float, float], Range(0, 1000, rising=True)]
+    # of that level; the key lamp has the rest
+    hdri_share: Annotated[tuple[float, float], Range(0, 1, rising=True)]
+    # name or path of an EXR -> factor on its share (a night stays dark)
+    hdris: Annotated[dict[str, float], Range(0, 1000)]
     n_lamps: Annotated[tuple[int, int], Range(1, 4, rising=True)]  # 1..4: key, fill, rim and one more
     fill_ratio: Annotated[tuple[float, float], Range(0, 100, rising=True)]  # of the key's level
     rim_ratio: Annotated[tuple[float, float], Range(0, 100, rising=True)]

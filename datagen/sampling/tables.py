@@ -43,12 +43,10 @@ class TableConfig:
     probability: Annotated[float, Range(0, 1)]  # where the motion works without one
     size_m: Annotated[tuple[float, float], Range(0.05, 100, rising=True)]  # of either side
     thickness_m: Annotated[tuple[float, float], Range(0.0001, 10, rising=True)]
-    lowered_m: Annotated[
-        tuple[float, float], Range(0, 10, rising=True)
-    ]  # below the lowest point of a hand that holds the object in mid-air
-    materials: Annotated[
-        dict[str, float], Range(0, 1e6)
-    ]  # wood, stone, cloth, laminate -> relative frequency
+    # below the lowest point of a hand that holds the object in mid-air
+    lowered_m: Annotated[tuple[float, float], Range(0, 10, rising=True)]
+    # wood, stone, cloth, laminate -> relative frequency
+    materials: Annotated[dict[str, float], Range(0, 1e6)]
 
     def __post_init__(self) -> None:
         unknown = set(self.materials) - set(get_args(TableMaterial))

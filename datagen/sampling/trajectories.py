@@ -27,18 +27,14 @@ class PathStyle:
     weight: Annotated[float, Range(0, 1e6)]  # relative frequency
     fov_deg: Annotated[tuple[float, float], Range(1, 170, rising=True)]  # horizontal
     elevation_deg: Annotated[tuple[float, float], Range(-90, 90, rising=True)]
-    azimuth_sweep_deg: Annotated[
-        tuple[float, float], Range(0, 3600, rising=True)
-    ]  # over the clip, either way round
-    elevation_sweep_deg: Annotated[
-        tuple[float, float], Range(0, 180, rising=True)
-    ]  # over the clip, up or down
-    zoom_out: Annotated[
-        tuple[float, float], Range(1, 100, rising=True)
-    ]  # last over first distance, or the reverse
-    floor_distance_m: Annotated[
-        tuple[float, float], Range(0, 100, rising=True)
-    ]  # never nearer to the target than this
+    # over the clip, either way round
+    azimuth_sweep_deg: Annotated[tuple[float, float], Range(0, 3600, rising=True)]
+    # over the clip, up or down
+    elevation_sweep_deg: Annotated[tuple[float, float], Range(0, 180, rising=True)]
+    # last over first distance, or the reverse
+    zoom_out: Annotated[tuple[float, float], Range(1, 100, rising=True)]
+    # never nearer to the target than this
+    floor_distance_m: Annotated[tuple[float, float], Range(0, 100, rising=True)]
     roll_deg: Annotated[float, Range(0, 180)]  # largest static roll
     shake_deg: Annotated[float, Range(0, 180)]  # largest tremble of direction and roll
     shake_m: Annotated[float, Range(0, 10)]  # largest tremble of the point looked at

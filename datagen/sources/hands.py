@@ -23,9 +23,8 @@ class HandConfig:
     mano_dir: Path | None  # folder of MANO_RIGHT.pkl; null: $MANO_DIR
     skin: Literal["open", "html", "auto"]
     html_dir: Path | None  # folder of TextureBasis; null: $HTML_DIR
-    left_probability: Annotated[
-        float, Range(0, 1)
-    ]  # of a motion with a left hand: the mirror image of a right one
+    # of a motion with a left hand: the mirror image of a right one
+    left_probability: Annotated[float, Range(0, 1)]
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.left_probability <= 1.0:

@@ -19,18 +19,16 @@ class DataConfig:
 
     datasets: tuple[str, ...]  # folders or fsspec URLs of datasets, or of single shards (".../shard-00000")
     split: Split
-    held_out_cameras: Annotated[
-        float, Range(0, 1)
-    ]  # share of each motion's cameras, the last by index, that is never trained on
+    # share of each motion's cameras, the last by index, that is never trained on
+    held_out_cameras: Annotated[float, Range(0, 1)]
     seed: Annotated[int, Range(0, 2**63 - 1)]
     augmentation: Augmentation
     samples_per_motion: Annotated[int, Range(1, 1_000_000_000)]  # per epoch, each with its own views
     workers: Annotated[int, Range(0, 1024)]  # loader processes; 0 loads in the calling process
     prefetch_batches: Annotated[int, Range(1, 10_000)]  # per worker
     cache_mb: Annotated[int, Range(0, 10_000_000)]  # of encoded clips, per worker
-    max_corrupt: Annotated[
-        int, Range(0, 1_000_000_000)
-    ]  # distinct corrupt rows that others take the place of; 0: the first one is an error
+    # distinct corrupt rows that others take the place of; 0: the first one is an error
+    max_corrupt: Annotated[int, Range(0, 1_000_000_000)]
 
     def __post_init__(self) -> None:
         _check(

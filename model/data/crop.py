@@ -41,13 +41,11 @@ _MASK_VALUE = 254
 class Augmentation:
     """How the square is drawn around hand and object, and how the image is varied."""
 
-    margin: Annotated[
-        tuple[float, float], Range(1, 100, rising=True)
-    ]  # side of the square over the longest side of the (turned) boxes, >= 1
+    # side of the square over the longest side of the (turned) boxes, >= 1
+    margin: Annotated[tuple[float, float], Range(1, 100, rising=True)]
     shift: Annotated[float, Range(0, 1)]  # 0: boxes in the centre; 1: anywhere inside the square
-    roll_deg: Annotated[
-        tuple[float, float], Range(-180, 180, rising=True)
-    ]  # turn of the camera, clockwise in the image
+    # turn of the camera, clockwise in the image
+    roll_deg: Annotated[tuple[float, float], Range(-180, 180, rising=True)]
     flip_probability: Annotated[float, Range(0, 1)]
 
     def __post_init__(self) -> None:

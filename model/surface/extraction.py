@@ -25,9 +25,8 @@ _END_SHARE = 0.005
 class ExtractionConfig:
     """How a surface is taken from decoded voxels."""
 
-    seal: Annotated[
-        int, Range(0, 100)
-    ]  # corners; gaps of up to twice as many in the shell of active voxels are closed
+    # corners; gaps of up to twice as many in the shell of active voxels are closed
+    seal: Annotated[int, Range(0, 100)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -18,9 +18,8 @@ class OptimizerConfig:
     betas: Annotated[tuple[float, float], Range(0, 1)]
     weight_decay: Annotated[float, Range(0, 1e3)]
     warmup_steps: Annotated[int, Range(0, 1_000_000_000)]  # linear from 0
-    final_factor: Annotated[
-        float, Range(0, 1)
-    ]  # cosine to this share of the rate at the last step; 1: constant
+    # cosine to this share of the rate at the last step; 1: constant
+    final_factor: Annotated[float, Range(0, 1)]
     clip_norm: Annotated[float, Range(1e-9, 1e9)]  # of the whole gradient
 
     def rate(self, step: int, steps: int) -> float:

@@ -53,9 +53,8 @@ class StartConfig:
     """Weights to start from instead of random ones."""
 
     weights: Path  # a file of ours
-    latent_scale: Annotated[
-        float, Range(1e-6, 1e6)
-    ]  # by which the latents were divided that they were trained on; TRELLIS: 1
+    # by which the latents were divided that they were trained on; TRELLIS: 1
+    latent_scale: Annotated[float, Range(1e-6, 1e6)]
 
     def __post_init__(self) -> None:
         if not self.latent_scale > 0:

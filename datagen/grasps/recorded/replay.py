@@ -42,9 +42,8 @@ class ReplayConfig:
     """How recorded motions are replayed."""
 
     time_scale: Annotated[float, Range(0.01, 100)]  # 1: as recorded; 2: the motion takes twice as long
-    carried_m: Annotated[
-        float, Range(0, 1)
-    ]  # the hand carries the object once it stays this close to its place in the hand ...
+    # the hand carries the object once it stays this close to its place in the hand ...
+    carried_m: Annotated[float, Range(0, 1)]
     carried_rad: Annotated[float, Range(0, 3.15)]  # ... and this close to its orientation
     min_digits: Annotated[int, Range(0, 5)]  # that touch the object at the end
     max_penetration_m: Annotated[float, Range(0, 1)]  # hand vertices into the object while it is carried

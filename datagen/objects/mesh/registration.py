@@ -34,15 +34,12 @@ class RegistrationConfig:
 
     n_points: Annotated[int, Range(10, 1_000_000)]  # per surface
     icp_steps: Annotated[int, Range(0, 10_000)]
-    max_size_error: Annotated[
-        float, Range(0, 10)
-    ]  # of the bbox sides after one common scale / diagonal of the rescaled mesh
-    max_residual: Annotated[
-        float, Range(0, 10)
-    ]  # 95th percentile of the surface distance / diagonal of the rescaled mesh
-    equally_good: Annotated[
-        float, Range(1, 100)
-    ]  # mean distances up to this factor apart are a tie (symmetric objects)
+    # of the bbox sides after one common scale / diagonal of the rescaled mesh
+    max_size_error: Annotated[float, Range(0, 10)]
+    # 95th percentile of the surface distance / diagonal of the rescaled mesh
+    max_residual: Annotated[float, Range(0, 10)]
+    # mean distances up to this factor apart are a tie (symmetric objects)
+    equally_good: Annotated[float, Range(1, 100)]
 
 
 REFERENCE_REGISTRATION = RegistrationConfig(

@@ -29,9 +29,8 @@ class TargetsConfig:
     """How many samples are stored per object."""
 
     surface_points: Annotated[int, Range(1, 10_000_000)]
-    sdf_near_points: Annotated[
-        int, Range(1, 10_000_000)
-    ]  # around the surface, normal offsets from N(0, sigma)
+    # around the surface, normal offsets from N(0, sigma)
+    sdf_near_points: Annotated[int, Range(1, 10_000_000)]
     sdf_near_sigma: Annotated[float, Range(0, 1)]  # canonical units (1 = longest side)
     sdf_uniform_points: Annotated[int, Range(1, 10_000_000)]  # in [-0.5, 0.5]^3
 

@@ -28,20 +28,16 @@ MCTS_NODES, RESOLUTION = 10, 1000
 class ConvexConfig:
     """CoACD's parameters and when to cut finer."""
 
-    thresholds: Annotated[
-        tuple[float, ...], Range(0.001, 1)
-    ]  # concavity, tried in turn until the excess is small enough
+    # concavity, tried in turn until the excess is small enough
+    thresholds: Annotated[tuple[float, ...], Range(0.001, 1)]
     max_hulls: Annotated[int, Range(1, 10_000)]
     max_hull_verts: Annotated[int, Range(4, 10_000)]
-    hull_tolerance_m: Annotated[
-        float, Range(0, 1)
-    ]  # a hull gets no more vertices once it is this close to its full form
-    max_excess_m: Annotated[
-        float, Range(0, 1)
-    ]  # hull surface outside the watertight mesh (99th percentile) that ends the search
-    max_faces: Annotated[
-        int, Range(100, 100_000_000)
-    ]  # the watertight mesh is lightened to about this many faces first
+    # a hull gets no more vertices once it is this close to its full form
+    hull_tolerance_m: Annotated[float, Range(0, 1)]
+    # hull surface outside the watertight mesh (99th percentile) that ends the search
+    max_excess_m: Annotated[float, Range(0, 1)]
+    # the watertight mesh is lightened to about this many faces first
+    max_faces: Annotated[int, Range(100, 100_000_000)]
     mcts_iterations: Annotated[int, Range(1, 10_000)]  # CoACD's search effort per cut; its own default is 150
     seed: Annotated[int, Range(0, 2**31 - 1)]
 

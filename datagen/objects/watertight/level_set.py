@@ -36,9 +36,8 @@ class LevelSetConfig:
     voxels_longest: Annotated[int, Range(16, 2048)]  # grid steps along the longest side
     min_voxel_m: Annotated[float, Range(1e-6, 1)]
     max_hole_m: Annotated[float, Range(0, 1)]  # holes narrower than this are closed
-    sheet_voxels: Annotated[
-        float, Range(1.75, 100)
-    ]  # thickness of single sheets; at least 1.75 or the grid loses them
+    # thickness of single sheets; at least 1.75 or the grid loses them
+    sheet_voxels: Annotated[float, Range(1.75, 100)]
 
     def voxel_m(self, verts: Float[np.ndarray, "vert 3"]) -> float:
         """Grid step for a mesh of this size."""

@@ -31,9 +31,8 @@ class WatertightConfig:
 
     level_set: LevelSetConfig
     tolerance_m: Annotated[float, Range(0, 1)]  # simplification moves the surface by less than this
-    max_faces: Annotated[
-        int, Range(100, 100_000_000)
-    ]  # quadric decimation beyond this, where the surface stays closed
+    # quadric decimation beyond this, where the surface stays closed
+    max_faces: Annotated[int, Range(100, 100_000_000)]
 
 
 @dataclass(frozen=True, kw_only=True)

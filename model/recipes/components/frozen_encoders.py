@@ -45,9 +45,8 @@ class EncodersConfig:
 
     image: EfficientNetConfig | DinoConfig
     hand: OwnHandEncoder | PackagedHandEncoder | WilorConfig
-    cached_views: Annotated[
-        int, Range(0, 1_000_000_000)
-    ]  # images whose features are kept; of use where crops repeat, 0: none
+    # images whose features are kept; of use where crops repeat, 0: none
+    cached_views: Annotated[int, Range(0, 1_000_000_000)]
 
 
 def encoder_digests(encoders: EncodersConfig) -> tuple[str, ...]:
