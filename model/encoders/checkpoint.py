@@ -18,6 +18,7 @@ from torch import Tensor
 from torch._utils import _rebuild_parameter, _rebuild_tensor_v2
 
 from model.errors import ModelError
+from model.tensor_files.torch_file import is_torchscript
 
 __all__ = ["load_state_dict"]
 
@@ -52,9 +53,8 @@ def _check_zip(path: Path, *, expected: str, action: str) -> None:
         raise ModelError(path, "there is no such file", expected=expected, action=action)
     if not zipfile.is_zipfile(path):
         raise ModelError(path, "is no zip archive", expected=expected, action=action)
-    with zipfile.ZipFile(path) as archive:
-        if any(name.endswith("/constants.pkl") for name in archive.namelist()):  # torch.load would compile it
-            raise ModelError(path, "is a TorchScript program", expected=expected, action=action)
+    if is_torchscript(path):
+        raise ModelError(path, "is a TorchScript program", expected=expected, action=action)
 
 
 class _Sealed(type):

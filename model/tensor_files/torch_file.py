@@ -12,7 +12,7 @@ from model.errors import ModelError
 from model.tensor_files.file_content import check_file, content_of, mistaken_for
 from model.tensor_files.safetensors_file import check_floats
 
-__all__ = ["read_torch_tensors"]
+__all__ = ["is_torchscript", "read_torch_tensors"]
 
 _NESTED = ("state_dict", "model")  # where other trainers put the tensors, beside what else they save
 _FORMATS = {torch.float32: "F32", torch.float16: "F16", torch.bfloat16: "BF16", torch.float64: "F64"}
@@ -33,7 +33,7 @@ def read_torch_tensors(path: Path, *, expected: str, action: str) -> dict[str, T
             action=mistaken.action if mistaken else action,
         )
     is_zip = zipfile.is_zipfile(path)
-    if is_zip and _is_program(path):
+    if is_zip and is_torchscript(path):
         raise ModelError(path, "is a TorchScript program", expected=expected, action=action)
     try:
         content = torch.load(path, map_location="cpu", mmap=is_zip, weights_only=True)
@@ -46,7 +46,8 @@ def read_torch_tensors(path: Path, *, expected: str, action: str) -> dict[str, T
     return tensors
 
 
-def _is_program(path: Path) -> bool:
+def is_torchscript(path: Path) -> bool:
+    """Whether a zip archive is a TorchScript program, which torch.load would compile."""
     with zipfile.ZipFile(path) as archive:
         return any(name.endswith("/constants.pkl") for name in archive.namelist())
 

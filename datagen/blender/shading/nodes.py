@@ -33,10 +33,6 @@ class Graph:
             "ShaderNodeMath", dict(enumerate(operands)), operation=operation, use_clamp=clamp
         ).outputs[0]
 
-    def vector(self, operation: str, *operands: Input) -> bpy.types.NodeSocket:
-        """A Vector Math node with a vector result."""
-        return self.node("ShaderNodeVectorMath", dict(enumerate(operands)), operation=operation).outputs[0]
-
     def noise(
         self, where: Input, scale: float, detail: float = 2.0, roughness: float = 0.5
     ) -> bpy.types.NodeSocket:

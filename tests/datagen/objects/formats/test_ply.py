@@ -2,7 +2,7 @@
 
 import io
 import struct
-from contextlib import suppress
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from datagen.objects.formats.ply import read_ply
 from datagen.objects.formats.reading import ReadingConfig, read_object
 from datagen.objects.mesh.surface_points import sample_surface
 from shards.color import linear_from_srgb
+from tests.datagen.objects.formats.damage import refusals
 
 CONFIG = ReadingConfig(unit="m", up_axis="z", max_faces=5000, max_image_px=256)
 CODES = {
@@ -418,8 +419,5 @@ def test_damage_anywhere_never_ends_in_another_error(tmp_path, form):
     whole = ply(
         mesh_of(faces=[*TETRA, (0, 2, 1, 3)], extra=rgb, values=[(1, 2, 3)] * 4), form, comments=TEXTURED
     )
-    rng = np.random.default_rng(0)
-    for at in range(len(whole)):
-        for data in (whole[:at], whole[:at] + rng.bytes(1) + whole[at + 1 :]):
-            with suppress(ObjectError):
-                read(tmp_path, data)
+    # Files that are cut in their first half have at most half of the mesh.
+    assert refusals(whole, partial(read, tmp_path)) >= len(whole) // 2

@@ -1,7 +1,7 @@
 """STL of many writers: dialects of text, counts that lie, colours, and what is no mesh."""
 
 import struct
-from contextlib import suppress
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,6 +11,7 @@ from datagen.objects.formats.reading import ReadingConfig, read_object
 from datagen.objects.formats.stl import read_stl
 from datagen.objects.mesh.surface_points import sample_surface
 from shards.color import linear_from_srgb
+from tests.datagen.objects.formats.damage import refusals
 
 CONFIG = ReadingConfig(unit="m", up_axis="z", max_faces=5000, max_image_px=256)
 VERTS = np.array([(0, 0, 0), (0.1, 0, 0), (0, 0.1, 0), (0, 0, 0.1)], dtype="<f4")
@@ -213,8 +214,5 @@ def test_bad_files_get_one_clear_line(case, tmp_path):
 
 @pytest.mark.parametrize("whole", [text(), binary(attributes=[0xFFFF] * 4), binary(header=HEADER)])
 def test_damage_anywhere_never_ends_in_another_error(tmp_path, whole):
-    rng = np.random.default_rng(0)
-    for at in range(len(whole)):
-        for data in (whole[:at], whole[:at] + rng.bytes(1) + whole[at + 1 :]):
-            with suppress(ObjectError):
-                read(tmp_path, data)
+    # Files that are cut in their first half have at most half of the mesh.
+    assert refusals(whole, partial(read, tmp_path)) >= len(whole) // 2
