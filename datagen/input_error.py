@@ -1,14 +1,8 @@
 """InputError: what can be wrong with a file or a setting that a user hands in."""
 
-__all__ = ["InputError", "printable"]
+from shards.printable import printable
 
-
-def printable(text: str) -> str:
-    """The text on one line that any terminal takes: a newline, or a byte of a file name that is no text, is escaped."""
-    return "".join(
-        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
-        for character in text
-    )
+__all__ = ["InputError"]
 
 
 class InputError(ValueError):

@@ -3,10 +3,10 @@
 import re
 from collections.abc import Sequence
 
-from datagen.input_error import printable
 from datagen.inspection.fitting_table import FittingTable, TableColumn
 from datagen.jobs.select_motions import Selection
 from datagen.plan.selection_rules import Decision, Rule, removed_by_rule
+from shards.printable import printable
 
 __all__ = ["selection_lines", "selection_table"]
 

@@ -19,9 +19,8 @@ from shards.splits import SplitRule, object_identity, split_of_object
 
 __all__ = ["SAME_SHAPE", "join_same_objects", "said_of_same_objects", "same_shapes"]
 
-SAME_SHAPE = (
-    0.005  # largest difference of two fingerprints of one shape; a side of a cube 1.6 % longer makes as much
-)
+# Largest difference of two fingerprints of one shape; a side of a cube 1.6 % longer makes as much.
+SAME_SHAPE = 0.005
 _SAME_SIZE = 0.03  # relative
 _SAME_COLOR = 0.08  # of the means, sRGB
 _COLORLESS = 0.02  # spread of the channels of a grey surface

@@ -21,10 +21,11 @@ from model.inference.record import write_record
 from model.inference.result_files import write_result
 from model.inference.stage_clock import StageClock
 from model.video.frame_choice import FrameChoice
-from model.video.frames import ReadLimits, VideoFrames, printable
+from model.video.frames import ReadLimits, VideoFrames
 from model.video.reading import read_frames, read_informative_frames
 from model.video.square_crop import parsed_box
 from model.video.staged_folder import staged_folder
+from shards.printable import printable
 
 __all__ = ["reconstruct_command"]
 

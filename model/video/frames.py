@@ -23,7 +23,6 @@ __all__ = [
     "checked_indices",
     "even_positions",
     "over_black",
-    "printable",
     "scaled_down",
     "scaled_size",
 ]
@@ -127,12 +126,6 @@ def checked_indices(indices: Sequence[int], n: int, source: str) -> list[int]:
         expected = f"different indices within 0..{n - 1}"
         raise ModelError(source, problem, expected=expected, action="Change --frames.")
     return sorted(indices)
-
-
-def printable(text: str) -> str:
-    """For terminals and images: what is no character in a file's name, or ends a line, is written as \\x0a is."""
-    shown = "".join(char if char.isprintable() or char == " " else repr(char)[1:-1] for char in text)
-    return shown.encode("utf-8", "backslashreplace").decode()
 
 
 def scaled_size(size: tuple[int, int], max_side_px: int) -> tuple[int, int]:

@@ -22,11 +22,11 @@ from model.video.frames import (
     checked_indices,
     even_positions,
     over_black,
-    printable,
     scaled_down,
 )
 from model.video.image_listing import ListedImages
 from model.video.orientation import EXIF_MATRICES, upright
+from shards.printable import printable
 
 __all__ = ["read_images"]
 

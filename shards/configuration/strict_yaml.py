@@ -70,9 +70,8 @@ def parse_yaml(text: str, where: str) -> object:
 def _check_size(text: str, where: str) -> None:
     """Refuse, event by event, what would not fit; nothing is built before."""
     depth, nodes = 0, 0
-    open_anchors: list[
-        tuple[str | None, int]
-    ] = []  # of the collections around an event, and the nodes before each
+    # Of the collections around an event, and the nodes before each.
+    open_anchors: list[tuple[str | None, int]] = []
     sizes: dict[str, int] = {}  # of anchored nodes, with all that their aliases stand for
     for event in yaml.parse(text, _Loader):
         if isinstance(event, yaml.AliasEvent):

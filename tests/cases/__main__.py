@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+from shards.printable import printable
 from tests.cases import folders, objects_gltf, objects_obj, objects_ply_stl, videos, weights
 from tests.cases.outcome import Case, Outcome, outcome_of
 
@@ -43,7 +44,7 @@ def main(arguments: Sequence[str], cases: Sequence[Case] = CASES) -> int:
 
 def _line(outcome: Outcome, width: int) -> str:
     text = f"{outcome.status:9}  {outcome.case:{width}}  {outcome.line}  ({outcome.seconds:.1f} s)"
-    return text.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+    return printable(text)
 
 
 def _without_row(root: Path, cases: Sequence[Case]) -> list[str]:
